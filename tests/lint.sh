@@ -73,7 +73,7 @@ declare -A doors=(
 	[core/scan]="geometry|grid|image|orbit|phantom"
 	[core/cpu]="none"
 	[core/correct]="averaging|correction|counts|images|input|lag|projection_noise|rings|scatter|scatter_images|stuck"
-	[core/refine]="agreement|reduced"
+	[core/refine]="agreement|reduced|refine"
 	[core/fit]="hardening|lag|scatter"
 	[core/recon]="algorithm|parameters|quality|recipe|recon|self_test"
 )

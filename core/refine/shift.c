@@ -9,6 +9,8 @@
 #include <stdlib.h>
 #include <string.h>
 
+#include "core/refine/detail.h"
+
 /* The edge's last value, repeated, makes detail as far as BORDER, which may be that of a body wider than the image. */
 enum { UNKNOWNS = 5, PASSES = 4, EDGE = 3, BORDER = 8 };
 static const double PI = 3.14159265358979323846;
@@ -19,51 +21,8 @@ static const double TUKEY = 4.685, MAD = 1.4826; /* 95 % efficiency; of a normal
 /* Images [row][column] of one view. */
 struct pair {
 	int columns, rows;
-	float *image, *other, *narrow, *wide, *work; /* [rows * columns] each, of one allocation */
+	float *image, *other, *work; /* [rows * columns] each, three of work, of one allocation */
 };
-
-/* ---- detail ---- */
-
-static void smooth_along(const float *from, size_t step, int count, const float *kernel, int reach, float *to)
-{
-	for (int i = 0; i < count; i++) {
-		float sum = 0;
-
-		for (int k = -reach; k <= reach; k++) {
-			const int at = i + k < 0 ? 0 : i + k >= count ? count - 1 : i + k;
-
-			sum += kernel[k + reach] * from[(size_t)at * step];
-		}
-		to[(size_t)i * step] = sum;
-	}
-}
-
-static void smooth(const struct pair *pair, const float *from, double sigma, float *to)
-{
-	enum { REACH_MOST = 8 };
-	const int reach = (int)ceil(3 * sigma);
-	float kernel[2 * REACH_MOST + 1], sum = 0;
-
-	for (int i = -reach; i <= reach; i++)
-		sum += kernel[i + reach] = (float)exp(-i * i / (2 * sigma * sigma));
-	for (int i = 0; i <= 2 * reach; i++)
-		kernel[i] /= sum;
-	for (int r = 0; r < pair->rows; r++)
-		smooth_along(from + (size_t)r * (size_t)pair->columns, 1, pair->columns, kernel, reach,
-			     pair->work + (size_t)r * (size_t)pair->columns);
-	for (int c = 0; c < pair->columns; c++)
-		smooth_along(pair->work + c, (size_t)pair->columns, pair->rows, kernel, reach, to + c);
-}
-
-static void keep_detail(const struct pair *pair, const float *from, float *to)
-{
-	const size_t pixels = (size_t)pair->columns * (size_t)pair->rows;
-
-	smooth(pair, from, FINE, pair->narrow);
-	smooth(pair, from, COARSE, pair->wide);
-	for (size_t i = 0; i < pixels; i++)
-		to[i] = pair->narrow[i] - pair->wide[i];
-}
 
 /* ---- what of the detail is unexplained ---- */
 
@@ -215,38 +174,6 @@ static int add_up(const struct pair *pair, const double unknowns[UNKNOWNS], doub
 	return count;
 }
 
-/* The value that half of the others are below; changes their order (Hoare 1961). */
-static double median_of(float *values, int count)
-{
-	int low = 0, high = count - 1;
-	const int wanted = count / 2;
-
-	while (low < high) {
-		const float pivot = values[(low + high) / 2];
-		int i = low, j = high;
-
-		while (i <= j) {
-			while (values[i] < pivot)
-				i++;
-			while (values[j] > pivot)
-				j--;
-			if (i <= j) {
-				const float value = values[i];
-
-				values[i++] = values[j];
-				values[j--] = value;
-			}
-		}
-		if (wanted <= j)
-			high = j;
-		else if (wanted >= i)
-			low = i;
-		else
-			break;
-	}
-	return (double)values[wanted];
-}
-
 static bool fit(const struct pair *pair, struct image_shift *ret_shift)
 {
 	/* A smoothed pixel shares its noise with so many others. */
@@ -278,19 +205,14 @@ int image_shift_find(const float *image, const float *other, int columns, int ro
 {
 	const size_t pixels = (size_t)columns * (size_t)rows;
 	float *all = malloc(5 * pixels * sizeof(*all));
-	const struct pair pair = {.columns = columns,
-				  .rows = rows,
-				  .image = all,
-				  .other = all + pixels,
-				  .narrow = all + 2 * pixels,
-				  .wide = all + 3 * pixels,
-				  .work = all + 4 * pixels};
+	const struct pair pair = {
+	    .columns = columns, .rows = rows, .image = all, .other = all + pixels, .work = all + 2 * pixels};
 	bool found;
 
 	if (all == NULL)
 		return error_set(err, ERR_NO_MEMORY, "no memory for images of %d x %d", columns, rows);
-	keep_detail(&pair, image, pair.image);
-	keep_detail(&pair, other, pair.other);
+	image_detail(image, columns, rows, FINE, COARSE, pair.work, pair.image);
+	image_detail(other, columns, rows, FINE, COARSE, pair.work, pair.other);
 	ret_shift->unexplained = unexplained_share(&pair, image);
 	found = fit(&pair, ret_shift);
 	free(all);

@@ -10,199 +10,13 @@
 #include <string.h>
 
 #include "core/refine/agreement.h"
-#include "core/scan/phantom.h"
+#include "tests/bench/bodies.h"
 #include "tests/unit/arm.h"
 
-enum { COLUMNS = 77, ROWS = 60, PARTS_MOST = 256 };
-static const double PIXEL = 4.928, WATER = 0.0192; /* mm; 1/mm */
-
-/* ---- random numbers: splitmix64 (Steele, Lea and Flood 2014) ---- */
-
-static uint64_t state;
-
-static double uniform(void)
-{
-	uint64_t z = state += 0x9e3779b97f4a7c15u;
-
-	z = (z ^ z >> 30) * 0xbf58476d1ce4e5b9u;
-	z = (z ^ z >> 27) * 0x94d049bb133111ebu;
-	return ((double)((z ^ z >> 31) >> 11) + 0.5) / 9007199254740992.0;
-}
-
-static double normal(void)
-{
-	const double radius = sqrt(-2 * log(uniform()));
-
-	return radius * cos(2 * M_PI * uniform());
-}
-
-/* ---- bodies ---- */
-
-struct body {
-	struct ellipsoid parts[PARTS_MOST];
-	int count;
-};
-
-static void add(struct body *body, enum shape shape, double a, double b, double c, double x, double y, double z,
-		double angle, double hu)
-{
-	if (body->count == PARTS_MOST)
-		abort();
-	body->parts[body->count++] = (struct ellipsoid){
-	    .shape = shape, .semi_axes = {a, b, c}, .centre = {x, y, z}, .angle = angle, .density = WATER * hu / 1000};
-}
-
-/* Small ellipsoids within an elliptic cylinder of these semi-axes and this half length, of r[0] .. r[1] mm. */
-static void scatter(struct body *body, int count, const double within[3], const double r[2], const double hu[2])
-{
-	for (int i = 0; i < count; i++) {
-		const double turn = 2 * M_PI * uniform(), out = .85 * sqrt(uniform());
-		const double a = r[0] + (r[1] - r[0]) * uniform(), b = a * (.6 + .8 * uniform());
-		const double c = a * (.6 + .8 * uniform()), z = within[2] * (2 * uniform() - 1), angle = 3 * uniform();
-		const double contrast = hu[0] + (hu[1] - hu[0]) * uniform();
-
-		add(body, SHAPE_ELLIPSOID, a, b, c, within[0] * out * cos(turn), within[1] * out * sin(turn), z, angle,
-		    uniform() < .5 ? -contrast : contrast);
-	}
-}
-
-static void make_head(struct body *body, bool neck)
-{
-	const double z = neck ? 25 : 0;
-
-	add(body, SHAPE_ELLIPSOID, 74, 92, 80, 0, 0, z, 0, 1000);
-	add(body, SHAPE_ELLIPSOID, 70, 88, 76, 0, 0, z, 0, 700);
-	add(body, SHAPE_ELLIPSOID, 64, 82, 70, 0, 0, z, 0, -660);
-	add(body, SHAPE_ELLIPSOID, 14, 10, 12, -20, -66, z - 20, 0, -1000);
-	add(body, SHAPE_ELLIPSOID, 14, 10, 12, 20, -66, z - 20, 0, -1000);
-	add(body, SHAPE_ELLIPSOID, 9, 14, 18, 0, -70, z - 40, 0, -900);
-	for (int i = -5; i <= 5; i++)
-		add(body, SHAPE_BOX, 2.5, 4, 6, i * 7, -55 - 14 * cos(i * .25), z - 62, i * .2, 1200);
-	add(body, SHAPE_ELLIPSOID, 12, 8, 10, -55, 8, z - 40, .4, 600);
-	add(body, SHAPE_ELLIPSOID, 12, 8, 10, 55, 8, z - 40, -.4, 600);
-	if (neck) {
-		add(body, SHAPE_CYLINDER, 45, 50, 80, 0, 10, -95, 0, 1000);
-		add(body, SHAPE_CYLINDER, 12, 11, 70, 0, 20, -90, 0, 400);
-		for (int i = 0; i < 5; i++)
-			add(body, SHAPE_CYLINDER, 14, 12, 7, 0, 22, -45 - 20 * i, 0, 300);
-	}
-	scatter(body, 25, (double[]){55, 70, 60}, (double[]){2, 9}, (double[]){20, 120});
-	scatter(body, 20, (double[]){66, 84, 70}, (double[]){1, 3}, (double[]){150, 500});
-}
-
-static void make_abdomen(struct body *body)
-{
-	add(body, SHAPE_CYLINDER, 160, 112, 140, 0, 0, 0, 0, 900);
-	add(body, SHAPE_CYLINDER, 144, 96, 140, 0, 0, 0, 0, 140);
-	add(body, SHAPE_ELLIPSOID, 60, 52, 70, -70, -12, 10, .3, 45);
-	add(body, SHAPE_ELLIPSOID, 26, 32, 50, 78, 28, 0, 0, 55);
-	for (int i = -4; i <= 4; i++) {
-		add(body, SHAPE_CYLINDER, 22, 18, 12, 0, 62, i * 30, 0, 300);
-		add(body, SHAPE_BOX, 4, 14, 6, 0, 88, i * 30 + 6, 0, 500);
-		add(body, SHAPE_BOX, 22, 3, 4, 0, 76, i * 30, 0, 400);
-	}
-	for (int i = -4; i <= 4; i++) {
-		add(body, SHAPE_ELLIPSOID, 40, 5, 5, -118, 30, i * 24, 1.1, 700);
-		add(body, SHAPE_ELLIPSOID, 40, 5, 5, 118, 30, i * 24, -1.1, 700);
-	}
-	scatter(body, 14, (double[]){100, 60, 60}, (double[]){5, 16}, (double[]){20, 100});
-	scatter(body, 8, (double[]){90, 60, 60}, (double[]){5, 15}, (double[]){900, 1000});
-}
-
-static void make_knee(struct body *body)
-{
-	add(body, SHAPE_CYLINDER, 58, 52, 140, 0, 0, 0, 0, 1000);
-	add(body, SHAPE_CYLINDER, 17, 16, 60, 0, 0, 75, 0, 500);
-	add(body, SHAPE_CYLINDER, 12, 11, 60, 0, 0, 75, 0, -350);
-	add(body, SHAPE_ELLIPSOID, 36, 26, 24, 0, 2, 18, 0, 450);
-	add(body, SHAPE_ELLIPSOID, 38, 27, 18, 0, 2, -20, 0, 450);
-	add(body, SHAPE_CYLINDER, 15, 14, 60, 0, 4, -80, 0, 500);
-	add(body, SHAPE_CYLINDER, 6, 6, 60, 30, 14, -80, 0, 600);
-	add(body, SHAPE_ELLIPSOID, 18, 8, 20, 0, -38, 15, 0, 500);
-	for (int i = 0; i < 5; i++) {
-		const double length = 22 + 10 * uniform(), x = 8 * (uniform() - .5), y = 4 + 10 * (uniform() - .5);
-		const double z = 40 * (uniform() - .5) - 10;
-
-		add(body, SHAPE_ELLIPSOID, length, 1.6, 1.6, x, y, z, .8 * (uniform() - .5) + (i % 2) * 1.2, 9000);
-	}
-	add(body, SHAPE_BOX, 2, 8, 30, 34, 0, -25, .1, 8000);
-	scatter(body, 30, (double[]){30, 22, 20}, (double[]){1, 3}, (double[]){80, 250});
-}
-
-static void make_even(struct body *body)
-{
-	add(body, SHAPE_CYLINDER, 75, 75, 140, 0, 0, 0, 0, 1000);
-	for (int i = 0; i < 6; i++)
-		add(body, SHAPE_ELLIPSOID, 8, 8, 8, 45 * cos(i), 45 * sin(i), 8 * (i - 3), 0, 50 + 30 * i);
-}
-
-static void make_hand(struct body *body)
-{
-	add(body, SHAPE_ELLIPSOID, 40, 16, 90, 0, 0, 0, 0, 1000);
-	for (int i = 0; i < 5; i++)
-		for (int j = 0; j < 4; j++) {
-			const double x = -28 + 14 * i, z = -55 + 34 * j + 3 * i;
-
-			add(body, SHAPE_ELLIPSOID, 5, 4.5, 14, x, 0, z, 0, 700);
-			add(body, SHAPE_ELLIPSOID, 3.4, 3, 12, x, 0, z, 0, -450);
-		}
-	scatter(body, 20, (double[]){30, 8, 60}, (double[]){1, 2.5}, (double[]){80, 300});
-}
-
-enum kind { HEAD, ABDOMEN, KNEE, HEAD_AND_NECK, EVEN, HAND, KINDS };
-static const char *const kind_names[KINDS] = {"head", "abdomen, truncated", "knee, screws", "head and neck", "even",
-					      "hand"};
-
-static void make_body(struct body *body, enum kind kind, int seed)
-{
-	double scale, shift[3];
-
-	body->count = 0;
-	state = (uint64_t)seed * 7919 + (uint64_t)kind;
-	scale = .93 + .14 * uniform();
-	for (int a = 0; a < 3; a++)
-		shift[a] = (a < 2 ? 12 : 10) * (uniform() - .5);
-	if (kind == ABDOMEN)
-		make_abdomen(body);
-	else if (kind == KNEE)
-		make_knee(body);
-	else if (kind == EVEN)
-		make_even(body);
-	else if (kind == HAND)
-		make_hand(body);
-	else
-		make_head(body, kind == HEAD_AND_NECK);
-	for (int i = 0; i < body->count; i++)
-		for (int a = 0; a < 3; a++) {
-			body->parts[i].semi_axes[a] *= scale;
-			body->parts[i].centre[a] = body->parts[i].centre[a] * scale + shift[a];
-		}
-}
+enum { COLUMNS = 77, ROWS = 60 };
+static const double PIXEL = 4.928; /* mm */
 
 /* ---- scans ---- */
-
-/* The means of four rays through a bin, as counts add up. */
-static void take(struct body *body, const struct view *view, float *ret_picture)
-{
-	const struct phantom phantom = {.count = body->count, .parts = body->parts};
-
-#pragma omp parallel for schedule(dynamic)
-	for (int r = 0; r < ROWS; r++)
-		for (int c = 0; c < COLUMNS; c++) {
-			double counts = 0;
-
-			for (int i = 0; i < 4; i++) {
-				const double column = c + i % 2 * .5 - .25, row = r + i / 2 * .5 - .25;
-				double to[3];
-
-				for (int a = 0; a < 3; a++)
-					to[a] =
-					    view->pixel0[a] + column * view->column_step[a] + row * view->row_step[a];
-				counts += exp(-phantom_line_integral(&phantom, view->source, to)) / 4;
-			}
-			ret_picture[r * COLUMNS + c] = (float)-log(counts);
-		}
-}
 
 static const struct {
 	double arc;
@@ -260,7 +74,7 @@ static int check(const struct departure *departure, const struct arm *arm, const
 		code = orbit_analyse(&orbit, &geometry, err);
 	if (code == 0)
 		code = reduced_open(&reduced, &geometry, &orbit, AGREEMENT_VIEWS_MOST, AGREEMENT_BINS_MOST, err);
-	state = (uint64_t)seed;
+	random_seed((uint64_t)seed);
 	for (int k = 0; k < arm->count && code == 0; k++) {
 		memcpy(picture, pictures + (size_t)k * pixels, pixels * sizeof(*picture));
 		for (size_t i = 0; i < pixels && departure->photons > 0; i++) {
@@ -309,7 +123,7 @@ static int measure(enum kind kind, int seed, double ret_mm[DEPARTURES], int ret_
 	for (int k = 0; k < views && code == 0; k++) {
 		const struct view view = arm_view(&arm, k);
 
-		take(&body, &view, pictures + (size_t)k * COLUMNS * ROWS);
+		body_take(&body, &view, COLUMNS, ROWS, pictures + (size_t)k * COLUMNS * ROWS);
 	}
 	for (int d = 0; d < DEPARTURES && code == 0; d++) {
 		struct agreement agreement;

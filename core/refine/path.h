@@ -1,0 +1,56 @@
+#ifndef CBCT_CORE_PATH_H
+#define CBCT_CORE_PATH_H
+
+#include <stdbool.h>
+
+#include "core/scan/geometry.h"
+
+/*
+ * Rigid motions of the object, one for each view, as a smooth path over the sweep: cubic B-splines of six numbers,
+ * three shifts in mm and three turns in hundredths of a radian, about the isocentre, so that a unit of each moves the
+ * object by about as much.
+ */
+enum { PATH_NUMBERS = 6, PATH_KNOTS_MOST = 48 };
+/* Squares and products of a residual (the first) and its derivatives by the six numbers; the lower triangle's rows. */
+enum { PATH_PRODUCTS = (PATH_NUMBERS + 1) * (PATH_NUMBERS + 2) / 2 };
+
+struct path {
+	/*
+	 * The numbers are along and about each view's columns, rows and beam, in this order; otherwise along and about
+	 * x, y and z, and their mean over the views is 0.
+	 */
+	bool of_views;
+	double length; /* of the sweep, radians */
+	int knots;
+	double numbers[PATH_KNOTS_MOST][PATH_NUMBERS];
+};
+
+/* A path of no motion; knots at least 4. */
+void path_open(struct path *ret_path, bool of_views, double length, int knots);
+/* The same path with twice as many intervals between its knots, as many as there may be. */
+void path_double(struct path *path);
+/* The six numbers at `at`, 0 .. length. */
+void path_at(const struct path *path, double at, double ret_numbers[PATH_NUMBERS]);
+
+/* Unit vectors along a view's columns, its rows, and across both. */
+void view_axes(const struct view *view, double ret_axes[3][3]);
+/* The motion at `at` of a view that stands there: mm and radians about the world's axes. */
+void path_motion(const struct path *path, double at, const struct view *view, double ret_motion[PATH_NUMBERS]);
+/* The view to which the object at rest looks as the moved one does to `view`. motion: mm, and a vector of rotation. */
+struct view view_of_moved(const struct view *view, const double motion[PATH_NUMBERS]);
+
+/* One view's part in the equations of a step. */
+struct path_view {
+	bool used;
+	double at;
+	struct view view;               /* as it stood before */
+	double products[PATH_PRODUCTS]; /* by numbers along and about x, y and z, divided by the residual's variance */
+};
+/*
+ * A step of Gauss and Newton, `factor` times its length; the numbers along and about a view's axes are expected to be
+ * within sigma[] of 0. Returns 0, or ERR_NO_MEMORY.
+ */
+int path_step(struct path *path, const struct path_view *views, int count, const double sigma[PATH_NUMBERS],
+	      double factor, struct error *err);
+
+#endif

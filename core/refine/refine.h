@@ -1,0 +1,54 @@
+#ifndef CBCT_CORE_REFINE_H
+#define CBCT_CORE_REFINE_H
+
+#include "core/backend.h"
+#include "core/refine/path.h"
+#include "core/refine/reduced.h"
+
+/*
+ * Where source and detector really stood, or how the object moved meanwhile, from nothing but the projections: 3D-2D
+ * registration of each view with a volume of the others, in turn with that volume's reconstruction.
+ *
+ * A volume that FDK makes follows the views of a short scan wherever they stand. Therefore it is made by SART with
+ * total variation in between, which draws it to what is even between edges: a volume that a wrong geometry has doubled
+ * edges in does not explain the views, and what it leaves unexplained, held against the derivatives of the projections
+ * by a rigid motion (projections of the volume's gradient), says how each view is to be moved (Gauss and Newton). Views
+ * far off, metal and what lies outside of the grid count for less (Cauchy's weights). The motions are a smooth path
+ * over the sweep, with few knots at first and then with more.
+ *
+ * One view in eight has no part in volume and path. What the volume says of these views, moved as the path says, is
+ * held against what the same iterations say of them without any motion; a path is kept only where that is better, and
+ * so are more knots.
+ *
+ * What all views share is no motion. Nor does a scan tell how large the object is: the way along the beam is expected
+ * to be small. Bins limit what can be found, to about a thirtieth of one.
+ */
+enum { REFINE_VIEWS_MOST = 120, REFINE_BINS_MOST = 80 };
+
+enum refine_kind {
+	REFINE_NONE,
+	REFINE_GEOMETRY, /* source and detector, as one body: smooth about the view's own axes */
+	REFINE_MOTION,   /* the object: smooth in the world */
+	REFINE_KINDS
+};
+
+struct refinement {
+	struct path path; /* no motion where it is not accepted */
+	bool accepted;
+	int held_out; /* views, */
+	double held_before,
+	    held_after; /* and the root mean square of their detail that is unexplained, without and with */
+	int better;     /* views among them that are explained better */
+};
+
+/* True if a scan has views, rows and columns enough. */
+bool refine_is_possible(const struct geometry *geometry, const struct orbit *orbit);
+/* Where a view stands on the path, radians from the first of the sweep on. */
+double refine_place(const struct orbit *orbit, int view);
+/* Bytes of the host's memory that refine_find takes: it works on the CPU's backend. */
+int refine_bytes(const struct reduced *reduced, size_t *ret_bytes, struct error *err);
+/* orbit: of the scan. mu_water in 1/mm. The same bits for any number of threads. cancel may be NULL. */
+int refine_find(const struct reduced *reduced, const struct orbit *orbit, enum refine_kind kind, double mu_water,
+		const struct cancel *cancel, struct refinement *ret_refinement, struct error *err);
+
+#endif

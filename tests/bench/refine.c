@@ -1,0 +1,370 @@
+/*
+ * What the refinement (core/refine/refine.h) makes of scans that were taken by an arm that sags, or of a head that
+ * nods: bodies with exact line integrals (tests/bench/bodies.h), given with the circle's geometry. For each scan the
+ * mean distance between where points lie and where the geometry says, in mm at the isocentre, before and after, and the
+ * FDK volume's root mean square error within the body, HU. Both are taken where the geometry fits the truth best as a
+ * whole: no scan tells where the object lay. `make bench-refine` builds and runs it; tests/bench/results/refine.txt has
+ * its table. Arguments: pixels along a row, views, degrees, first seed, seeds, first departure, the one behind the
+ * last, and the only body (0: head, 1: abdomen, 2: knee).
+ */
+#include <math.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <time.h>
+
+#ifdef _OPENMP
+#include <omp.h>
+#endif
+
+#include "core/fdk.h"
+#include "core/fit/least_squares.h"
+#include "core/refine/refine.h"
+#include "tests/bench/bodies.h"
+#include "tests/unit/arm.h"
+
+enum { GRID_MOST = 160, POINTS = 18, STRIDE = 3 };
+static const double HU = 1000 / BODY_WATER, WIDTH = 379.456; /* mm, of the detector */
+
+/* How the arm, or the object, departs from what the scan says. */
+static const struct departure {
+	const char *name;
+	enum refine_kind kind;
+	double sag, jitter, nod, photons;
+} departures[] = {
+    {"fits", REFINE_GEOMETRY, 0, 0, 0, 0},
+    {"fits, 20,000 photons", REFINE_GEOMETRY, 0, 0, 0, 2e4},
+    {"a tenth of the sag", REFINE_GEOMETRY, .1, 0, 0, 0},
+    {"the same, 20,000 photons", REFINE_GEOMETRY, .1, 0, 0, 2e4},
+    {"a third of the sag", REFINE_GEOMETRY, .3, 0, 0, 0},
+    {"still", REFINE_MOTION, 0, 0, 0, 2e4},
+    {"nod of 3 degrees, 3 mm", REFINE_MOTION, 0, 0, 3, 2e4},
+};
+enum { DEPARTURES = sizeof(departures) / sizeof(departures[0]) };
+
+struct scan {
+	struct body body;
+	struct arm arm;
+	struct geometry truth, said;
+	float *projections;
+};
+
+/* The nod: within a tenth of the sweep, about a neck, and along y and z; and in another place before and behind. */
+static void nod_at(double share, double nod, double ret_motion[PATH_NUMBERS])
+{
+	static const double neck[3] = {0, 20, -60};
+	const double passed = fmin(.5, fmax(-.5, (share - .5) / .1)), part = .5 + .5 * sin(M_PI * passed);
+	const double turn = nod * M_PI / 180 * part;
+
+	memset(ret_motion, 0, PATH_NUMBERS * sizeof(*ret_motion));
+	ret_motion[3] = turn;
+	ret_motion[1] = neck[1] - (cos(turn) * neck[1] - sin(turn) * neck[2]) + nod / sqrt(2) * part;
+	ret_motion[2] = neck[2] - (sin(turn) * neck[1] + cos(turn) * neck[2]) + nod / sqrt(2) * part;
+}
+
+static int open_scan(struct scan *scan, const struct departure *departure, enum kind kind, int seed, int columns,
+		     int count, double arc, struct error *err)
+{
+	const size_t pixels = (size_t)columns * (size_t)(columns * 60 / 77);
+	int code;
+
+	*scan = (struct scan){.arm = {.columns = columns,
+				      .rows = columns * 60 / 77,
+				      .count = count,
+				      .pixel = WIDTH / columns,
+				      .first = .3 + seed,
+				      .step = arc * M_PI / 180 / (arc < 360 ? count - 1 : count),
+				      .seed = (unsigned)seed,
+				      .sag = departure->sag,
+				      .jitter = departure->jitter}};
+	code = arm_nominal_geometry(&scan->arm, &scan->said, err);
+	if (code == 0)
+		code = geometry_copy(&scan->truth, &scan->said, err);
+	scan->projections = malloc((size_t)count * pixels * sizeof(float));
+	if (code == 0 && scan->projections == NULL)
+		code = error_set(err, ERR_NO_MEMORY, "no memory for %d views", count);
+	if (code < 0)
+		return code;
+	make_body(&scan->body, kind, seed);
+	for (int k = 0; k < count; k++) {
+		double motion[PATH_NUMBERS];
+		struct view view = arm_view(&scan->arm, k);
+
+		nod_at((double)k / count, departure->nod, motion);
+		scan->truth.views[k] = view_of_moved(&view, motion);
+		body_take(&scan->body, &scan->truth.views[k], columns, scan->arm.rows,
+			  scan->projections + (size_t)k * pixels);
+	}
+	random_seed((uint64_t)seed);
+	for (size_t i = 0; i < (size_t)count * pixels && departure->photons > 0; i++) {
+		const double mean = departure->photons * exp(-(double)scan->projections[i]);
+
+		scan->projections[i] = (float)-log(fmax(.5, mean + sqrt(mean) * normal()) / departure->photons);
+	}
+	return 0;
+}
+
+static void close_scan(struct scan *scan)
+{
+	geometry_clear(&scan->truth);
+	geometry_clear(&scan->said);
+	free(scan->projections);
+}
+
+/* ---- how far a geometry is off ---- */
+
+struct pair {
+	const struct geometry *truth, *said;
+};
+
+/* Pixels between where points lie and where the geometry says, moved as a whole, at the isocentre in mm. */
+static void distances(void *context, const double *motion, double *ret)
+{
+	const struct pair *pair = context;
+	const double mm = vec_norm(pair->said->views[0].column_step) * 620 / 1100;
+
+	for (int k = 0; k < pair->truth->count; k += STRIDE) {
+		const struct view moved = view_of_moved(&pair->said->views[k], motion);
+		double there[12], here[12];
+
+		view_matrix(&pair->truth->views[k], there);
+		view_matrix(&moved, here);
+		for (int i = 0; i < POINTS; i++) {
+			const double point[3] = {60 * cos(i * M_PI / 3), 60 * sin(i * M_PI / 3), 45 * (i / 6 - 1)};
+			double a[2], b[2];
+
+			view_project(there, point, &a[0], &a[1]);
+			view_project(here, point, &b[0], &b[1]);
+			*ret++ = mm * (a[0] - b[0]);
+			*ret++ = mm * (a[1] - b[1]);
+		}
+	}
+}
+
+/* *ret_mm, and the motion of all of it that leaves the least. */
+static int compare(const struct geometry *truth, const struct geometry *said, double *ret_mm,
+		   double ret_motion[PATH_NUMBERS], struct error *err)
+{
+	struct pair pair = {truth, said};
+	const struct least_squares problem = {.parameters = PATH_NUMBERS,
+					      .residuals = 2 * POINTS * ((truth->count + STRIDE - 1) / STRIDE),
+					      .context = &pair,
+					      .residuals_of = distances,
+					      .step = 1e-4,
+					      .most = 30};
+	double rms;
+	int code;
+
+	memset(ret_motion, 0, PATH_NUMBERS * sizeof(*ret_motion));
+	code = least_squares(&problem, ret_motion, &rms, err);
+	*ret_mm = rms * sqrt(2);
+	return code;
+}
+
+/* ---- the volume's error ---- */
+
+static int fdk_volume(const struct geometry *geometry, const float *projections, const struct grid *grid, float *ret,
+		      struct error *err)
+{
+	const struct backend *backend = &backend_cpu;
+	struct orbit orbit = {0};
+	struct fdk_weights weights = {0};
+	struct device *device = NULL;
+	struct plan *plan = NULL;
+	struct fdk fdk = {0};
+	struct stack *stack = NULL;
+	struct volume *volume = NULL;
+	struct plan_options options = {.geometry = geometry, .grid = grid, .no_samples = true, .no_projection = true};
+	int code = orbit_analyse(&orbit, geometry, err);
+
+	if (code == 0)
+		code = fdk_weights_make(&weights, &orbit, geometry, WINDOW_HANN, 1, true, err);
+	options.column_weights = weights.columns;
+	options.filter_response = weights.response;
+	memcpy(options.pad, weights.pad, sizeof(options.pad));
+	memcpy(options.axis, weights.axis, sizeof(options.axis));
+	options.extend = weights.extend;
+	options.extended_response = weights.extended;
+	options.linearise.sample = SAMPLE_FLOAT32;
+	if (code == 0)
+		code = backend->open(0, &(struct device_options){0}, &device, err);
+	if (code == 0)
+		code = backend->plan_new(device, &options, &plan, err);
+	if (code == 0)
+		code = fdk_open(&fdk, backend, device, plan, geometry, weights.pad, err);
+	if (code == 0)
+		code = backend->stack_new(device, geometry->columns, geometry->rows, geometry->count, &stack, err);
+	if (code == 0)
+		code = backend->volume_new(device, grid, &volume, err);
+	if (code == 0)
+		code = backend->stack_upload(stack, 0, geometry->count, projections, err);
+	if (code == 0)
+		code = backend->volume_fill(volume, 0, err);
+	for (int k = 0; k < geometry->count && code == 0; k++)
+		code = fdk_add(&fdk, k, k, stack, volume, err);
+	if (code == 0)
+		code = fdk_flush(&fdk, stack, volume, err);
+	if (code == 0)
+		code = backend->volume_download(volume, 0, grid->size[2], ret, err);
+	backend->volume_free(volume);
+	backend->stack_free(stack);
+	fdk_clear(&fdk);
+	backend->plan_free(plan);
+	backend->close(device);
+	fdk_weights_clear(&weights);
+	orbit_clear(&orbit);
+	return code;
+}
+
+/* HU, within the body but for its metal, in every other voxel along each axis. */
+static int body_error(const struct scan *scan, const struct geometry *geometry, const double motion[PATH_NUMBERS],
+		      double *ret_hu, struct error *err)
+{
+	const struct phantom phantom = {.count = scan->body.count, .parts = (struct ellipsoid *)scan->body.parts};
+	struct geometry moved = {0};
+	struct grid grid;
+	struct orbit orbit;
+	float *volume = NULL;
+	double squares = 0, radius = 0;
+	long count = 0;
+	int code = orbit_analyse(&orbit, &scan->said, err);
+
+	if (code == 0) {
+		orbit_default_grid(&orbit, &scan->said, GRID_MOST, &grid);
+		radius = .45 * orbit.field_of_view;
+		volume = malloc(grid_voxels(&grid) * sizeof(float));
+		code = geometry_copy(&moved, geometry, err);
+	}
+	for (int k = 0; k < geometry->count && code == 0; k++)
+		moved.views[k] = view_of_moved(&geometry->views[k], motion);
+	if (code == 0)
+		code = fdk_volume(&moved, scan->projections, &grid, volume, err);
+#pragma omp parallel for reduction(+ : squares, count) schedule(dynamic)
+	for (int z = 2; z < grid.size[2] - 2; z += 2)
+		for (int y = 0; y < grid.size[1]; y += 2)
+			for (int x = 0; x < grid.size[0] && code == 0; x += 2) {
+				const double p[3] = {grid.origin[0] + x * grid.spacing[0],
+						     grid.origin[1] + y * grid.spacing[1],
+						     grid.origin[2] + z * grid.spacing[2]};
+				double density = 0;
+
+				if (hypot(p[0], p[1]) > radius)
+					continue;
+				for (int i = 0; i < 8; i++) {
+					double q[3];
+
+					for (int a = 0; a < 3; a++)
+						q[a] = p[a] + ((i >> a & 1) - .5) / 2 * grid.spacing[a];
+					density += phantom_density(&phantom, q) / 8;
+				}
+				if (density < .3 * BODY_WATER || density > 3 * BODY_WATER)
+					continue;
+				squares += pow(HU * ((double)volume[grid_voxel(&grid, x, y, z)] - density), 2);
+				count++;
+			}
+	*ret_hu = sqrt(squares / (double)(count > 0 ? count : 1));
+	geometry_clear(&moved);
+	orbit_clear(&orbit);
+	free(volume);
+	return code;
+}
+
+/* ---- one scan ---- */
+
+static int refine(const struct scan *scan, enum refine_kind kind, struct geometry *ret_geometry,
+		  struct refinement *ret_refinement, struct error *err)
+{
+	const size_t pixels = (size_t)scan->arm.columns * (size_t)scan->arm.rows;
+	struct reduced reduced = {0};
+	struct orbit orbit = {0};
+	int code = orbit_analyse(&orbit, &scan->said, err);
+
+	if (code == 0)
+		code = reduced_open(&reduced, &scan->said, &orbit, REFINE_VIEWS_MOST, REFINE_BINS_MOST, err);
+	for (int k = 0; k < scan->said.count && code == 0; k++)
+		if (reduced_wants(&reduced, k))
+			reduced_take(&reduced, k, scan->projections + (size_t)k * pixels);
+	if (code == 0)
+		code = refine_find(&reduced, &orbit, kind, BODY_WATER, NULL, ret_refinement, err);
+	if (code == 0)
+		code = geometry_copy(ret_geometry, &scan->said, err);
+	for (int k = 0; k < scan->said.count && code == 0; k++) {
+		double motion[PATH_NUMBERS];
+
+		path_motion(&ret_refinement->path, refine_place(&orbit, k), &scan->said.views[k], motion);
+		ret_geometry->views[k] = view_of_moved(&scan->said.views[k], motion);
+	}
+	reduced_clear(&reduced);
+	orbit_clear(&orbit);
+	return code;
+}
+
+static double processor_seconds(void)
+{
+	return (double)clock() / CLOCKS_PER_SEC;
+}
+
+static int measure(const struct departure *departure, enum kind kind, int seed, int columns, int count, double arc,
+		   struct error *err)
+{
+	static const double still[PATH_NUMBERS] = {0};
+	struct scan scan;
+	struct geometry refined = {0};
+	struct refinement refinement;
+	double mm[2], hu[4], motion[2][PATH_NUMBERS], seconds = 0;
+	int code = open_scan(&scan, departure, kind, seed, columns, count, arc, err);
+
+	if (code == 0) {
+		seconds = processor_seconds();
+		code = refine(&scan, departure->kind, &refined, &refinement, err);
+		seconds = processor_seconds() - seconds;
+	}
+	if (code == 0)
+		code = compare(&scan.truth, &scan.said, &mm[0], motion[0], err);
+	if (code == 0)
+		code = compare(&scan.truth, &refined, &mm[1], motion[1], err);
+	if (code == 0)
+		code = body_error(&scan, &scan.truth, still, &hu[0], err);
+	if (code == 0)
+		code = body_error(&scan, &scan.said, still, &hu[1], err);
+	if (code == 0)
+		code = body_error(&scan, &scan.said, motion[0], &hu[2], err);
+	if (code == 0)
+		code = body_error(&scan, &refined, motion[1], &hu[3], err);
+	if (code == 0)
+		printf("%-26s %-18s %3d  %5.0f %6.1f %6.1f %6.1f %6.1f  %6.3f %6.3f  %-4s %5.1f %% %3d/%2d %5d %7.1f\n",
+		       departure->name, kind_names[kind], seed, arc, hu[0], hu[1], hu[2], hu[3], mm[0], mm[1],
+		       refinement.accepted ? "yes" : "no",
+		       refinement.accepted ? 100 * (1 - refinement.held_after / refinement.held_before) : 0.,
+		       refinement.better, refinement.held_out, refinement.path.knots, seconds);
+	fflush(stdout);
+	geometry_clear(&refined);
+	close_scan(&scan);
+	return code;
+}
+
+int main(int argc, char **argv)
+{
+	const int columns = argc > 1 ? atoi(argv[1]) : 154, views = argc > 2 ? atoi(argv[2]) : 120;
+	const double arc = argc > 3 ? atof(argv[3]) : 200;
+	const int first = argc > 4 ? atoi(argv[4]) : 21, seeds = argc > 5 ? atoi(argv[5]) : 1;
+	const int from = argc > 6 ? atoi(argv[6]) : 0, to = argc > 7 ? atoi(argv[7]) : DEPARTURES;
+	const int body = argc > 8 ? atoi(argv[8]) : HEAD, bodies = argc > 8 ? body + 1 : KNEE + 1;
+
+	printf("%-26s %-18s %3s  %5s %6s %6s %6s %6s  %6s %6s  %-4s %7s %6s %5s %7s\n", "departure", "body", "", "arc",
+	       "true", "said", "whole", "after", "mm", "after", "kept", "better", "views", "knots", "seconds");
+	fflush(stdout);
+	for (int d = from; d < to && d < DEPARTURES; d++)
+		for (int kind = body; kind < bodies; kind++)
+			for (int seed = first; seed < first + seeds; seed++) {
+				struct error err;
+
+				if (departures[d].kind == REFINE_MOTION && kind != HEAD)
+					continue;
+				if (measure(&departures[d], (enum kind)kind, seed, columns, views, arc, &err) < 0) {
+					fprintf(stderr, "%s\n", err.text);
+					return EXIT_FAILURE;
+				}
+			}
+	return EXIT_SUCCESS;
+}

@@ -1,0 +1,284 @@
+/*
+ * Refinement of poses: paths of motions against what they are made of, and a scan by exact line integrals, as an arm
+ * takes it that does not stand where the scan says, or of a head that moves.
+ */
+#include <check.h>
+#include <math.h>
+#include <stdlib.h>
+#include <string.h>
+
+#ifdef _OPENMP
+#include <omp.h>
+#endif
+
+#include "core/refine/refine.h"
+#include "core/scan/phantom.h"
+#include "tests/unit/arm.h"
+#include "tests/unit/scene.h"
+
+enum { COLUMNS = 44, ROWS = 36, VIEWS = 56, PARTS = 24 };
+static const double PIXEL = 8.4, WATER = 0.0192;
+
+static void project(const struct view *view, const double point[3], double ret[2])
+{
+	double matrix[12];
+
+	view_matrix(view, matrix);
+	view_project(matrix, point, &ret[0], &ret[1]);
+}
+
+/* A point of the moved object in a view is where the point at rest is in the view that is told for it. */
+START_TEST(a_moved_object_is_seen_by_a_moved_view)
+{
+	static const double motion[PATH_NUMBERS] = {3, -2, 5, .2, -.1, .3}, point[3] = {40, -25, 30};
+	static const double turn[3] = {.2, -.1, .3};
+	const struct arm arm = {.columns = COLUMNS, .rows = ROWS, .count = 4, .pixel = PIXEL, .step = 1};
+	const struct view view = arm_nominal(&arm, 1), moved = view_of_moved(&view, motion);
+	const double angle = vec_norm(turn), axis[3] = {turn[0] / angle, turn[1] / angle, turn[2] / angle};
+	double across[3], there[3], here[2], expected[2];
+
+	vec_cross(axis, point, across);
+	for (int a = 0; a < 3; a++)
+		there[a] = cos(angle) * point[a] + sin(angle) * across[a] +
+			   (1 - cos(angle)) * vec_dot(axis, point) * axis[a] + motion[a];
+	project(&view, there, expected);
+	project(&moved, point, here);
+	ck_assert_double_eq_tol(here[0], expected[0], 1e-9);
+	ck_assert_double_eq_tol(here[1], expected[1], 1e-9);
+}
+END_TEST
+
+START_TEST(more_knots_do_not_change_a_path)
+{
+	struct path path, fine;
+
+	path_open(&path, true, 3, 7);
+	for (int k = 0; k < path.knots; k++)
+		for (int i = 0; i < PATH_NUMBERS; i++)
+			path.numbers[k][i] = sin(5 * k + i);
+	fine = path;
+	path_double(&fine);
+	ck_assert_int_eq(fine.knots, 11);
+	for (double at = 0; at <= 3; at += .1) {
+		double a[PATH_NUMBERS], b[PATH_NUMBERS];
+
+		path_at(&path, at, a);
+		path_at(&fine, at, b);
+		for (int i = 0; i < PATH_NUMBERS; i++)
+			ck_assert_double_eq_tol(a[i], b[i], 1e-12);
+	}
+}
+END_TEST
+
+/* Residuals that are the derivatives times known numbers: one step finds these, about the views' axes or the world's.
+ */
+START_TEST(a_step_finds_what_made_the_residuals)
+{
+	static const double far[PATH_NUMBERS] = {1e6, 1e6, 1e6, 1e6, 1e6, 1e6};
+	const bool of_views = _i == 0;
+	const struct arm arm = {.columns = COLUMNS, .rows = ROWS, .count = VIEWS, .pixel = PIXEL, .step = .06};
+	struct path_view *views = calloc(VIEWS, sizeof(*views));
+	struct path truth, path;
+	struct error err;
+	uint64_t random = 3;
+
+	path_open(&truth, of_views, .06 * (VIEWS - 1), 7);
+	path = truth;
+	for (int k = 0; k < truth.knots; k++)
+		for (int i = 0; i < PATH_NUMBERS; i++)
+			truth.numbers[k][i] = cos(3 * k + 2 * i);
+	for (int v = 0; v < VIEWS; v++) {
+		double motion[PATH_NUMBERS];
+
+		views[v] = (struct path_view){.used = v % 9 != 4, .at = .06 * v, .view = arm_nominal(&arm, v)};
+		path_motion(&truth, views[v].at, &views[v].view, motion);
+		for (int pixel = 0; pixel < 20; pixel++) {
+			double value[PATH_NUMBERS + 1] = {0};
+			int at = 0;
+
+			for (int i = 1; i <= PATH_NUMBERS; i++) {
+				random = random * 6364136223846793005u + 1442695040888963407u;
+				value[i] = (double)(random >> 33) / 1e9 - 1;
+				value[0] += value[i] * motion[i - 1] * (i > 3 ? 100 : 1);
+			}
+			for (int i = 0; i <= PATH_NUMBERS; i++)
+				for (int j = 0; j <= i; j++)
+					views[v].products[at++] += value[i] * value[j];
+		}
+	}
+	ck_assert_int_eq(path_step(&path, views, VIEWS, far, 1, &err), 0);
+	for (int v = 0; v < VIEWS; v += 5) {
+		double found[PATH_NUMBERS], expected[PATH_NUMBERS], other[PATH_NUMBERS], start[PATH_NUMBERS];
+
+		path_at(&path, views[v].at, found);
+		path_at(&truth, views[v].at, expected);
+		/* About the world's axes the mean is taken off: differences along the path stay. */
+		path_at(&path, 0, other);
+		path_at(&truth, 0, start);
+		for (int i = 0; i < PATH_NUMBERS; i++)
+			ck_assert_double_eq_tol(found[i] - (of_views ? 0 : other[i]),
+						expected[i] - (of_views ? 0 : start[i]), 1e-6);
+	}
+	free(views);
+}
+END_TEST
+
+/* ---- scans ---- */
+
+static void take(const struct geometry *truth, float *ret)
+{
+	struct ellipsoid parts[PARTS] = {
+	    {.semi_axes = {74, 90, 78}, .centre = {0, 0, 5}, .density = 1.6 * WATER},
+	    {.semi_axes = {66, 82, 70}, .centre = {0, 0, 5}, .density = -.6 * WATER},
+	    {.shape = SHAPE_BOX, .semi_axes = {9, 12, 8}, .centre = {20, -35, 10}, .angle = .4, .density = .9 * WATER},
+	    {.shape = SHAPE_BOX, .semi_axes = {8, 9, 12}, .centre = {-30, 15, -20}, .angle = 1, .density = -.9 * WATER},
+	};
+	const struct phantom phantom = {.count = PARTS, .parts = parts};
+
+	for (int i = 4; i < PARTS; i++)
+		parts[i] = (struct ellipsoid){.semi_axes = {4 + i % 5, 5 + i % 4, 4 + i % 6},
+					      .centre = {45 * sin(2. * i), 55 * cos(3. * i), 5 * (i - 14)},
+					      .density = (i % 2 ? .5 : -.4) * WATER};
+	for (int k = 0; k < truth->count; k++)
+		phantom_project(&phantom, truth, k, ret + (size_t)k * COLUMNS * ROWS);
+}
+
+/* Root mean square distance at the isocentre, mm, of points where two geometries show them, less what all share. */
+static double distance(const struct geometry *truth, const struct geometry *said)
+{
+	static const double points[4][3] = {{60, 0, 40}, {-60, 20, -40}, {0, -60, 30}, {10, 60, -30}};
+	double squares = 0;
+
+	for (int p = 0; p < 4; p++)
+		for (int k = 0; k < truth->count; k++) {
+			double a[2], b[2];
+
+			project(&truth->views[k], points[p], a);
+			project(&said->views[k], points[p], b);
+			squares += pow(a[0] - b[0], 2) + pow(a[1] - b[1], 2);
+		}
+	return sqrt(squares / (4. * truth->count)) * PIXEL * 620 / 1100;
+}
+
+struct found {
+	struct refinement refinement;
+	double before, after; /* mm */
+};
+
+/* A sway of the detector along its columns and rows that no common motion explains, `sway` mm; a turn of the head. */
+static struct found find(double sway, double nod)
+{
+	const struct arm arm = {
+	    .columns = COLUMNS, .rows = ROWS, .count = VIEWS, .pixel = PIXEL, .first = .2, .step = 3.5 / (VIEWS - 1)};
+	float *projections = malloc(sizeof(float) * VIEWS * COLUMNS * ROWS);
+	struct geometry said, truth, refined;
+	struct reduced reduced;
+	struct orbit orbit;
+	struct found found;
+	struct error err;
+
+	ck_assert_int_eq(arm_nominal_geometry(&arm, &said, &err), 0);
+	ck_assert_int_eq(geometry_copy(&truth, &said, &err), 0);
+	ck_assert_int_eq(geometry_copy(&refined, &said, &err), 0);
+	for (int k = 0; k < VIEWS; k++) {
+		const double share = (double)k / (VIEWS - 1);
+		const double motion[PATH_NUMBERS] = {0, 0, 0, nod * tanh(8 * (share - .5)), 0, 0};
+		struct view *view = &truth.views[k];
+
+		for (int a = 0; a < 3; a++)
+			view->pixel0[a] +=
+			    sway * 1100 / 620 / PIXEL *
+			    (sin(9 * share) * view->column_step[a] + cos(11 * share) * view->row_step[a]);
+		*view = view_of_moved(view, motion);
+	}
+	take(&truth, projections);
+	ck_assert_int_eq(orbit_analyse(&orbit, &said, &err), 0);
+	ck_assert(refine_is_possible(&said, &orbit));
+	ck_assert_int_eq(reduced_open(&reduced, &said, &orbit, REFINE_VIEWS_MOST, REFINE_BINS_MOST, &err), 0);
+	for (int k = 0; k < VIEWS; k++)
+		reduced_take(&reduced, k, projections + (size_t)k * COLUMNS * ROWS);
+	ck_assert_msg(refine_find(&reduced, &orbit, nod != 0 ? REFINE_MOTION : REFINE_GEOMETRY, WATER, NULL,
+				  &found.refinement, &err) == 0,
+		      "%s", err.text);
+	for (int k = 0; k < VIEWS; k++) {
+		double motion[PATH_NUMBERS];
+
+		path_motion(&found.refinement.path, refine_place(&orbit, k), &said.views[k], motion);
+		refined.views[k] = view_of_moved(&said.views[k], motion);
+	}
+	found.before = distance(&truth, &said);
+	found.after = distance(&truth, &refined);
+	reduced_clear(&reduced);
+	orbit_clear(&orbit);
+	geometry_clear(&said);
+	geometry_clear(&truth);
+	geometry_clear(&refined);
+	free(projections);
+	return found;
+}
+
+START_TEST(a_detector_that_sways_is_found)
+{
+	const struct found found = find(1.5, 0);
+
+	ck_assert_msg(found.refinement.accepted, "%d of %d views are better", found.refinement.better,
+		      found.refinement.held_out);
+	ck_assert_int_eq(found.refinement.held_out, VIEWS / 8);
+	ck_assert_double_lt(found.refinement.held_after, found.refinement.held_before);
+	ck_assert_msg(found.after < .5 * found.before, "%g mm of %g", found.after, found.before);
+}
+END_TEST
+
+START_TEST(a_head_that_nods_is_followed)
+{
+	const struct found found = find(0, .03);
+
+	ck_assert(found.refinement.accepted);
+	ck_assert_msg(found.after < .5 * found.before, "%g mm of %g", found.after, found.before);
+}
+END_TEST
+
+START_TEST(a_geometry_that_fits_is_left_alone)
+{
+	const struct found found = find(0, 0);
+
+	ck_assert_msg(!found.refinement.accepted || found.after < .1, "%g mm where nothing was to be found",
+		      found.after);
+	ck_assert(found.refinement.accepted || found.after == 0);
+}
+END_TEST
+
+START_TEST(any_number_of_threads_finds_the_same)
+{
+#ifdef _OPENMP
+	const int threads = omp_get_max_threads();
+	struct found one, three;
+
+	omp_set_num_threads(1);
+	one = find(1, 0);
+	omp_set_num_threads(3);
+	three = find(1, 0);
+	omp_set_num_threads(threads);
+	ck_assert_mem_eq(&one.refinement.path, &three.refinement.path, sizeof(one.refinement.path));
+#endif
+}
+END_TEST
+
+Suite *refine_suite(void);
+Suite *refine_suite(void)
+{
+	Suite *suite = suite_create("refine");
+	TCase *paths = tcase_create("paths"), *scans = tcase_create("scans");
+
+	tcase_add_test(paths, a_moved_object_is_seen_by_a_moved_view);
+	tcase_add_test(paths, more_knots_do_not_change_a_path);
+	tcase_add_loop_test(paths, a_step_finds_what_made_the_residuals, 0, 2);
+	suite_add_tcase(suite, paths);
+	tcase_set_timeout(scans, 300);
+	tcase_add_test(scans, a_detector_that_sways_is_found);
+	tcase_add_test(scans, a_head_that_nods_is_followed);
+	tcase_add_test(scans, a_geometry_that_fits_is_left_alone);
+	tcase_add_test(scans, any_number_of_threads_finds_the_same);
+	suite_add_tcase(suite, scans);
+	return suite;
+}
