@@ -54,7 +54,10 @@ struct recipe {
 	enum projector projector;
 	bool rings;    /* errors of pixels' gain are looked for and mended (core/correct/rings.h) */
 	bool hold_out; /* some views have no part in the volumes, which are held against them (core/recon/held_out.h) */
-	int binning;   /* pixels a side that are taken as one (core/correct/binning.h); BINNING_AUTO until resolved */
+	struct {
+		bool geometry, motion; /* one of them at most: how views are moved to fit (core/refine/refine.h) */
+	} refine;
+	int binning; /* pixels a side that are taken as one (core/correct/binning.h); BINNING_AUTO until resolved */
 	struct {
 		bool on; /* needs fdk.on */
 		double threshold_hu;

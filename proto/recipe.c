@@ -117,6 +117,13 @@ static int read_metal(struct recipe *recipe, const cJSON *value, struct error *e
 	return parameters_read(value, "/metal", &set, recipe, err);
 }
 
+static int read_refine(struct recipe *recipe, const cJSON *value, struct error *err)
+{
+	const struct parameter_set set = members_of("/refine");
+
+	return parameters_read(value, "/refine", &set, recipe, err);
+}
+
 static int read_emitted(struct json_reader *reader, const cJSON *element, int index, int *ret_emit)
 {
 	char place[32];
@@ -168,11 +175,12 @@ static void read_emit(struct json_reader *reader, struct recipe *recipe)
 	recipe->emits = count;
 }
 
-enum { STAGES = 4 };
+enum { STAGES = 5 };
 static const struct {
 	const char *name;
 	int (*read)(struct recipe *, const cJSON *, struct error *);
-} stages[STAGES] = {{"grid", read_grid}, {"fdk", read_fdk}, {"tv", read_tv}, {"metal", read_metal}};
+} stages[STAGES] = {
+    {"grid", read_grid}, {"fdk", read_fdk}, {"tv", read_tv}, {"metal", read_metal}, {"refine", read_refine}};
 
 /* An algorithm's member; the recipe has the first algorithm that the document names. */
 static int read_algorithm(struct recipe *recipe, const struct algorithm *algorithm, const cJSON *value,
@@ -386,7 +394,7 @@ static bool add_recipe(cJSON *document, const struct recipe *recipe)
 				  recipe);
 	return added && add_stage(document, "tv", "/tv", recipe->tv.on, recipe) &&
 	       add_stage(document, "metal", "/metal", recipe->metal.on, recipe) &&
-	       parameters_add(document, &set, recipe);
+	       add_stage(document, "refine", "/refine", true, recipe) && parameters_add(document, &set, recipe);
 }
 
 cJSON *recipe_json(const struct recipe *recipe)

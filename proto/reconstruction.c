@@ -397,8 +397,10 @@ struct reconstruction {
 	struct scatter_file scatter; /* where the scan has images of it */
 	int *scattered;              /* [images], the projections that have one */
 	struct scatter_source scatter_source;
-	float *errors, *flat; /* of pixels' gain, and the image that has them; NULL where there are none */
-	bool looked;          /* what is asked of all views for their pixels is known */
+	float *errors, *flat;  /* of pixels' gain, and the image that has them; NULL where there are none */
+	bool looked;           /* what is asked of all views for their pixels is known */
+	bool refined;          /* what is asked of all views for their poses is known */
+	struct geometry poses; /* that were found, owned; no views: the scan's own */
 };
 
 static int projection_of(const struct reconstruction *reconstruction, int view)
@@ -519,15 +521,38 @@ static int resume(struct reconstruction *reconstruction, struct error *err)
 	return 0;
 }
 
+static bool looks_for_poses(const struct reconstruction *reconstruction)
+{
+	const struct recipe *recipe = reconstruction->options->recipe;
+
+	return (recipe->refine.geometry || recipe->refine.motion) && !reconstruction->refined;
+}
+
+/* Before the geometry is refined no iteration is gone on from: it stands on another geometry. */
 static int open_recon(struct reconstruction *reconstruction, struct error *err)
 {
-	const struct reconstruction_options *options = reconstruction->options;
-	int code = recon_open(reconstruction->backend, reconstruction->device, &reconstruction->files.scan->geometry,
-			      &reconstruction->linearise, options->recipe, &reconstruction->hooks,
-			      &reconstruction->recon, err);
+	const struct geometry *geometry =
+	    reconstruction->poses.views != NULL ? &reconstruction->poses : &reconstruction->files.scan->geometry;
+	struct recipe recipe = *reconstruction->options->recipe;
+	int code;
 
+	if (reconstruction->refined)
+		recipe.refine.geometry = recipe.refine.motion = false;
+	code = recon_open(reconstruction->backend, reconstruction->device, geometry, &reconstruction->linearise,
+			  &recipe, &reconstruction->hooks, &reconstruction->recon, err);
 	reconstruction->run.recon = reconstruction->recon;
-	return code == 0 && reconstruction->resumed ? resume(reconstruction, err) : code;
+	return code == 0 && reconstruction->resumed && !looks_for_poses(reconstruction) ? resume(reconstruction, err)
+											: code;
+}
+
+/* Opens the reconstruction anew, without a projection. */
+static int open_again(struct reconstruction *reconstruction, struct error *err)
+{
+	recon_free(reconstruction->recon);
+	reconstruction->recon = NULL;
+	reconstruction->run.recon = NULL;
+	reconstruction->pushed = 0;
+	return open_recon(reconstruction, err);
 }
 
 static int open_first(struct reconstruction *reconstruction, struct error *err)
@@ -623,11 +648,70 @@ static int heed_pixels(struct reconstruction *reconstruction, bool *ret_again, s
 	    reconstruction->linearise.stuck != NULL || reconstruction->flat != NULL || reconstruction->errors != NULL;
 	if (code < 0 || !*ret_again)
 		return code;
-	recon_free(reconstruction->recon);
-	reconstruction->recon = NULL;
-	reconstruction->run.recon = NULL;
-	reconstruction->pushed = 0;
-	return open_recon(reconstruction, err);
+	return open_again(reconstruction, err);
+}
+
+/* Says what was changed, the mean and the most over the views: mm and degrees. */
+static void tell_refinement(struct reconstruction *reconstruction, const struct refinement *refinement)
+{
+	const bool motion = reconstruction->options->recipe->refine.motion;
+	const struct path *path = &refinement->path;
+	double squares[2] = {0}, most[2] = {0};
+	enum { PLACES = 256 };
+	char detail[400];
+
+	for (int i = 0; i < PLACES; i++) {
+		double numbers[PATH_NUMBERS], size[2];
+
+		path_at(path, path->length * i / (PLACES - 1), numbers);
+		size[0] = vec_norm(numbers);
+		size[1] = vec_norm(numbers + 3) * PATH_TURN_UNIT * 180 / M_PI;
+		for (int k = 0; k < 2; k++) {
+			squares[k] += size[k] * size[k] / PLACES;
+			most[k] = fmax(most[k], size[k]);
+		}
+	}
+	if (refinement->accepted)
+		snprintf(
+		    detail, sizeof(detail),
+		    "%s by %.2g mm and %.2g degrees (root mean square over the sweep; at most %.2g mm and %.2g "
+		    "degrees); %d of %d views that were held out agree better, what is unexplained of their detail "
+		    "fell by %.0f %%",
+		    motion ? "the object moved" : "views were moved", sqrt(squares[0]), sqrt(squares[1]), most[0],
+		    most[1], refinement->better, refinement->held_out,
+		    100 * (1 - refinement->held_after / refinement->held_before));
+	else
+		snprintf(detail, sizeof(detail),
+			 refinement->held_out > 0 ? "%d views that were held out do not agree better with any other"
+						  : "%d views could be held out: too few views, pixels or degrees",
+			 refinement->held_out);
+	run_warning(&reconstruction->run,
+		    !refinement->accepted ? "not_refined"
+		    : motion              ? "motion_followed"
+					  : "geometry_refined",
+		    detail);
+}
+
+/*
+ * Called once all projections have been pushed. Where another geometry fits them better the reconstruction is opened
+ * anew with it, *ret_again, and has none of them; a resumed one, too, to go on from its checkpoint.
+ */
+static int heed_poses(struct reconstruction *reconstruction, bool *ret_again, struct error *err)
+{
+	struct refinement refinement;
+	int code;
+
+	*ret_again = false;
+	if (!looks_for_poses(reconstruction))
+		return 0;
+	code = recon_refine(reconstruction->recon, &refinement, &reconstruction->poses, err);
+	if (code < 0)
+		return code;
+	reconstruction->refined = true;
+	*ret_again = refinement.accepted || reconstruction->resumed;
+	if (!reconstruction->resumed)
+		tell_refinement(reconstruction, &refinement);
+	return *ret_again ? open_again(reconstruction, err) : 0;
 }
 
 /* Sets the provenance in the volumes' files, but for stage and iteration. */
@@ -794,6 +878,7 @@ void reconstruction_close(struct reconstruction *reconstruction)
 	stuck_free(reconstruction->stuck);
 	free(reconstruction->errors);
 	free(reconstruction->flat);
+	geometry_clear(&reconstruction->poses);
 	scan_files_close(&reconstruction->files);
 	scatter_file_close(&reconstruction->scatter);
 	free(reconstruction->scattered);
@@ -1001,6 +1086,12 @@ int reconstruction_finish(struct reconstruction *reconstruction, struct error *e
 		       ? heed_pixels(reconstruction, &again, err)
 		       : 0;
 
+	if (code == 0 && again)
+		code = reconstruction_push_rest(reconstruction, err);
+	if (code == 0 && reconstruction->pushed == reconstruction_wanted(reconstruction))
+		code = heed_poses(reconstruction, &again, err);
+	else
+		again = false;
 	if (code == 0 && again)
 		code = reconstruction_push_rest(reconstruction, err);
 	if (code == 0)

@@ -64,7 +64,7 @@ for name in sys.stdin.read().split():
 )"
 # The rooms of core/ and daemon/, lowest first, each with those beneath it whose doors it may use; a room's own files
 # may include each other. A room's doors are the headers that others may include: ROOM/ROOM.h, or those named in doors.
-core_rooms=("scan:" "calibrate: scan" "cpu: scan" "outofcore: scan" "cards: scan" "refine: scan" "correct: scan refine" "fit: scan correct" "recon: scan outofcore correct")
+core_rooms=("scan:" "calibrate: scan" "cpu: scan" "outofcore: scan" "cards: scan" "refine: scan" "correct: scan refine" "fit: scan correct" "recon: scan outofcore refine correct")
 daemon_rooms=("http:" "store:" "volumes: store" "jobs: store" "calibrations: store" "sendings: store jobs"
 	"fleet: store jobs" "dicom:" "intake: http store"
 	"api: http store volumes jobs calibrations sendings fleet intake")

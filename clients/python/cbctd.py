@@ -110,6 +110,8 @@ _PARAMETERS: Dict[str, Dict[str, Document]] = {
         "/tv/unit": {"type": "number", "minimum": 1e-12, "maximum": 1000000000000},
         "/tv/after": {"type": "choice", "choices": ["sart", "fdk+sart"]},
         "/metal/threshold_hu": {"type": "number", "minimum": 500, "maximum": 1000000},
+        "/refine/geometry": {"type": "boolean"},
+        "/refine/motion": {"type": "boolean"},
         "/projector": {"type": "choice", "choices": ["interpolating", "matched"]},
         "/binning": {"type": "integer", "minimum": 1, "maximum": 8, "word": "auto"},
         "/rings": {"type": "boolean"},

@@ -8,6 +8,7 @@
 #include "core/recon/alternation.h"
 #include "core/recon/ends.h"
 #include "core/recon/held_out.h"
+#include "core/recon/refining.h"
 #include "core/recon/rim.h"
 #include "core/recon/stopping.h"
 #include "core/recon/support.h"
@@ -46,6 +47,7 @@ struct recon {
 	struct alternation *alternation; /* from slice to slice, not in volumes that are kept; NULL: views see it */
 	struct rim *rim;                 /* of the field of view, in volumes that are kept; NULL: it is the iterate's */
 	struct support *support;         /* NULL until a volume is kept */
+	struct refining *refining;       /* NULL where the geometry is not refined */
 	struct held_out *held_out;       /* NULL where no view is held out */
 	struct stack *forecast;          /* what a volume says of views that are held out; NULL where none are */
 	bool smoothed;                   /* while a volume is kept, `before` has the iterate */

@@ -196,7 +196,7 @@ static int memory_on(const struct backend *backend, struct device *device, struc
 					   .orbit = &recon->orbit,
 					   .recipe = recipe,
 					   .averages = recipe_averages(recipe, &recon->orbit)};
-	const size_t kept = kept_bytes(recon);
+	size_t kept = kept_bytes(recon);
 	struct walk beside = {.backend = backend, .device = device, .measures = true}, planned = beside;
 	struct correction_bytes around = {0};
 	struct recon_memory memory = {0};
@@ -204,6 +204,8 @@ static int memory_on(const struct backend *backend, struct device *device, struc
 	struct plan_bytes bytes;
 	int code = corrections_bytes(&ask, &recon->input.linearise, &around, err);
 
+	if (code == 0)
+		code = refining_bytes(recipe, recon->geometry, &recon->orbit, &kept, err);
 	if (code == 0)
 		code = walk_beside(recon, &beside, err);
 	if (code == 0)

@@ -122,6 +122,11 @@ const struct parameter recipe_parameters[] = {
     {"/metal", "threshold_hu", PARAMETER_NUMBER, AT(metal.threshold_hu), RANGE(METAL_HU_LEAST, METAL_HU_MOST),
      .preset = 2500, .counts = corrects_metal, .unit = "HU",
      .help = "Metal is what has at least this value in the FDK volume; its streaks are removed."},
+    {"/refine", "geometry", PARAMETER_FLAG, AT(refine.geometry),
+     .help = "Whether each view's pose is fitted to the volume that the other views make, where the arm does not stand "
+	     "as its geometry says."},
+    {"/refine", "motion", PARAMETER_FLAG, AT(refine.motion),
+     .help = "Whether the object's rigid motion during the sweep is found and followed."},
     {"", "projector", PARAMETER_CHOICE, AT(projector), NAMES(projector_names), .presets = PRESET_VARIES,
      .preset = PROJECTOR_INTERPOLATING,
      .help = "How iterations project backwards; by default as the algorithm needs it."},

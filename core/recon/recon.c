@@ -195,6 +195,8 @@ int recon_open(const struct backend *backend, struct device *device, const struc
 	if (code == 0 && recon->recipe.hold_out)
 		code = held_out_new(&recon->orbit, recon->geometry, &recon->held_out, err);
 	if (code == 0)
+		code = refining_new(&recon->recipe, recon->geometry, &recon->orbit, &recon->refining, err);
+	if (code == 0)
 		code = open_corrections(recon, err);
 	if (code == 0)
 		code = open_algorithm(recon, err);
@@ -218,6 +220,7 @@ void recon_clear(struct recon *recon)
 	if (recon->algorithm_state != NULL)
 		recon->recipe.algorithm->close(&recon->problem, recon->algorithm_state);
 	support_free(recon->support);
+	refining_free(recon->refining);
 	held_out_free(recon->held_out);
 	ends_free(recon->ends);
 	rim_free(recon->rim);
@@ -271,6 +274,8 @@ static int push_view(struct recon *recon, const void *samples, int view, struct 
 	if (recon->pushed[view])
 		return error_set(err, ERR_CONFLICT, "view %d came a second time", view);
 	code = corrections_take(&recon->corrections, samples, view, slot, recon->projections, err);
+	if (code == 0)
+		code = refining_take(recon->refining, recon->backend, recon->projections, slot, view, err);
 	if (code < 0)
 		return code;
 	recon->pushed[view] = 1;
@@ -302,6 +307,41 @@ int recon_push(struct recon *recon, const void *samples, const int *views, int c
 			return code;
 	}
 	return 0;
+}
+
+/* The detector's own views, moved as the path says of those that all goes by. */
+static int move_views(const struct recon *recon, const struct path *path, struct geometry *ret_geometry,
+		      struct error *err)
+{
+	int code = geometry_copy(ret_geometry, recon->given, err);
+
+	for (int k = 0; k < recon->geometry->count && code == 0; k++) {
+		double motion[PATH_NUMBERS];
+
+		path_motion(path, refine_place(&recon->orbit, k), &recon->geometry->views[k], motion);
+		ret_geometry->views[k] = view_of_moved(&recon->given->views[k], motion);
+	}
+	return code;
+}
+
+int recon_refine(struct recon *recon, struct refinement *ret_refinement, struct geometry *ret_geometry,
+		 struct error *err)
+{
+	const struct input *input = &recon->input;
+	struct refinement refinement = {.held_out = 0};
+	int code = 0;
+
+	if (recon->pushed_count < recon->geometry->count)
+		return error_set(err, ERR_CONFLICT, "%d of %d views have come", recon->pushed_count,
+				 recon->geometry->count);
+	if (recon->refining != NULL)
+		code = refining_find(recon->refining, &recon->recipe, &recon->orbit, input->blank, input->counts.blank,
+				     &recon->cancel, &refinement, err);
+	if (code == 0 && refinement.accepted)
+		code = move_views(recon, &refinement.path, ret_geometry, err);
+	if (code == 0)
+		*ret_refinement = refinement;
+	return code;
 }
 
 int recon_resume(struct recon *recon, const float *volume, int iteration, struct error *err)

@@ -3,6 +3,7 @@
 
 #include "core/backend.h"
 #include "core/recon/recipe.h"
+#include "core/refine/refine.h"
 
 /*
  * One reconstruction: FDK, then an iterative algorithm, with TV after the FDK volume
@@ -119,6 +120,15 @@ void recon_free(struct recon *recon);
  * linearised, and filtered and backprojected where FDK is on, however many a call brings.
  */
 int recon_push(struct recon *recon, const void *samples, const int *views, int count, struct error *err);
+
+/*
+ * After the last view, where the recipe asks to refine the geometry: fits it (core/refine/refine.h). What is accepted
+ * makes *ret_geometry, which a reconstruction opened anew goes by; free with geometry_clear. Where nothing was tried or
+ * accepted it stays untouched, and this reconstruction goes on. The same views give the same bits, so that a resumed
+ * run gets the geometry that its checkpoint was made with.
+ */
+int recon_refine(struct recon *recon, struct refinement *ret_refinement, struct geometry *ret_geometry,
+		 struct error *err);
 
 /* Called once, after the last view: finishes FDK, then TV, iterations and TV in turn, calling the hooks. */
 int recon_run(struct recon *recon, struct error *err);

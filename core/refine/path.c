@@ -5,8 +5,6 @@
 #include <stdlib.h>
 #include <string.h>
 
-static const double TURN_UNIT = 0.01; /* radians */
-
 void path_open(struct path *ret_path, bool of_views, double length, int knots)
 {
 	*ret_path = (struct path){.of_views = of_views, .length = length, .knots = knots};
@@ -95,7 +93,7 @@ void path_motion(const struct path *path, double at, const struct view *view, do
 	view_axes(view, axes);
 	to_world(path, axes, numbers, ret_motion);
 	for (int i = 3; i < PATH_NUMBERS; i++)
-		ret_motion[i] *= TURN_UNIT;
+		ret_motion[i] *= PATH_TURN_UNIT;
 }
 
 /* Turns x back about the vector `turn` by its length (Rodrigues 1840). */

@@ -10,6 +10,7 @@
  * three shifts in mm and three turns in hundredths of a radian, about the isocentre, so that a unit of each moves the
  * object by about as much.
  */
+#define PATH_TURN_UNIT 0.01 /* radians */
 enum { PATH_NUMBERS = 6, PATH_KNOTS_MOST = 48 };
 /* Squares and products of a residual (the first) and its derivatives by the six numbers; the lower triangle's rows. */
 enum { PATH_PRODUCTS = (PATH_NUMBERS + 1) * (PATH_NUMBERS + 2) / 2 };

@@ -50,6 +50,7 @@ export const groups = [
 		number('/tv/iterations', 'Iterations', { step: 1 }), choice('/tv/after', 'After', ['fdk+sart', 'sart']), number('/tv/unit', 'Gray level, 1/mm'),
 	] },
 	{ title: 'Metal', pointer: '/metal', optional: true, rare: true, off: 'not corrected', fields: [number('/metal/threshold_hu', 'From, HU')] },
+	{ title: 'Geometry', pointer: '/refine', optional: true, rare: true, off: 'as the scan says', fields: [flag('/refine/geometry', 'Refine from the projections'), flag('/refine/motion', 'Follow the patient’s motion')] },
 	{ title: 'Job', pointer: '', fields: [
 		text('/emit', 'Keep volumes', { hint: 'fdk, fdk-tv, iterations', empty: 'the last one only', wide: true, read: value => value.split(/[\s,]+/).filter(Boolean).map(name => /^\d+$/.test(name) ? Number(name) : name),
 			write: list => (list ?? []).join(', ') }),

@@ -1,0 +1,86 @@
+/* Views on their way to the refinement of the geometry: see refining.h. */
+#include "core/recon/refining.h"
+
+#include <stdlib.h>
+
+struct refining {
+	struct reduced reduced;
+	float *view; /* [row][column], on its way into bins */
+};
+
+static bool is_wanted(const struct recipe *recipe, const struct geometry *geometry, const struct orbit *orbit)
+{
+	return (recipe->refine.geometry || recipe->refine.motion) && refine_is_possible(geometry, orbit);
+}
+
+int refining_new(const struct recipe *recipe, const struct geometry *geometry, const struct orbit *orbit,
+		 struct refining **ret_refining, struct error *err)
+{
+	struct refining *refining;
+	int code;
+
+	if (!is_wanted(recipe, geometry, orbit))
+		return 0;
+	refining = calloc(1, sizeof(*refining));
+	if (refining == NULL)
+		return error_set(err, ERR_NO_MEMORY, "no memory to refine a geometry");
+	code = reduced_open(&refining->reduced, geometry, orbit, REFINE_VIEWS_MOST, REFINE_BINS_MOST, err);
+	refining->view = malloc((size_t)geometry->columns * (size_t)geometry->rows * sizeof(float));
+	if (code == 0 && refining->view == NULL)
+		code = error_set(err, ERR_NO_MEMORY, "no memory for a view");
+	if (code < 0)
+		refining_free(refining);
+	else
+		*ret_refining = refining;
+	return code;
+}
+
+void refining_free(struct refining *refining)
+{
+	if (refining == NULL)
+		return;
+	reduced_clear(&refining->reduced);
+	free(refining->view);
+	free(refining);
+}
+
+int refining_bytes(const struct recipe *recipe, const struct geometry *geometry, const struct orbit *orbit,
+		   size_t *bytes, struct error *err)
+{
+	struct reduced reduced;
+	size_t working = 0;
+	int code;
+
+	if (!is_wanted(recipe, geometry, orbit))
+		return 0;
+	code = reduced_open(&reduced, geometry, orbit, REFINE_VIEWS_MOST, REFINE_BINS_MOST, err);
+	if (code < 0)
+		return code;
+	code = refine_bytes(&reduced, &working, err);
+	*bytes += working + reduced_bytes(geometry, REFINE_VIEWS_MOST, REFINE_BINS_MOST) +
+		  (size_t)geometry->columns * (size_t)geometry->rows * sizeof(float);
+	reduced_clear(&reduced);
+	return code;
+}
+
+int refining_take(struct refining *refining, const struct backend *backend, struct stack *from, int slot, int view,
+		  struct error *err)
+{
+	int code;
+
+	if (refining == NULL || !reduced_wants(&refining->reduced, view))
+		return 0;
+	code = backend->stack_download(from, slot, 1, refining->view, err);
+	if (code == 0)
+		reduced_take(&refining->reduced, view, refining->view);
+	return code;
+}
+
+int refining_find(struct refining *refining, const struct recipe *recipe, const struct orbit *orbit, const int *blank,
+		  int blanks, const struct cancel *cancel, struct refinement *ret_refinement, struct error *err)
+{
+	for (int i = 0; i < blanks; i++)
+		reduced_leave_out(&refining->reduced, blank[i]);
+	return refine_find(&refining->reduced, orbit, recipe->refine.motion ? REFINE_MOTION : REFINE_GEOMETRY,
+			   recipe->mu_water, cancel, ret_refinement, err);
+}

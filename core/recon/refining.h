@@ -1,0 +1,24 @@
+#ifndef CBCT_CORE_REFINING_H
+#define CBCT_CORE_REFINING_H
+
+#include "core/recipe.h"
+#include "core/refine/refine.h"
+
+/* The views of a job that refines its geometry, in bins, until all have come. */
+struct refining;
+
+/* *ret_refining stays NULL where the recipe does not ask for it, or the scan has too few views or pixels. */
+int refining_new(const struct recipe *recipe, const struct geometry *geometry, const struct orbit *orbit,
+		 struct refining **ret_refining, struct error *err);
+void refining_free(struct refining *refining); /* NULL is fine */
+/* Adds the bytes of the host's memory that it takes. */
+int refining_bytes(const struct recipe *recipe, const struct geometry *geometry, const struct orbit *orbit,
+		   size_t *bytes, struct error *err);
+/* Takes a view's line integrals. NULL is fine. */
+int refining_take(struct refining *refining, const struct backend *backend, struct stack *from, int slot, int view,
+		  struct error *err);
+/* Leaves views out that show nothing, and finds the motions. */
+int refining_find(struct refining *refining, const struct recipe *recipe, const struct orbit *orbit, const int *blank,
+		  int blanks, const struct cancel *cancel, struct refinement *ret_refinement, struct error *err);
+
+#endif
