@@ -36,23 +36,16 @@ test_a_geometry_that_fits_stays() {
 }
 
 test_an_arm_that_wanders_is_followed_and_gone_on_with() {
-	local iterations='"sart": {"iterations": 200}, "refine": {"geometry": true}}' first plain
+	local iterations='"sart": {"iterations": 40}, "refine": {"geometry": true}}' first yielded
 	post_scan "$work/wanders"
 	post_projections "$work/wanders"
-	post_job "$recipe"'"fdk": {}}'
-	wait_job succeeded
-	plain=$(digest)
 	post_job "$recipe$iterations"
 	wait_job succeeded
 	told geometry_refined
 	first=$(digest)
-	post_job "$recipe"'"fdk": {}, "refine": {"geometry": true}}'
-	wait_job succeeded
-	told geometry_refined
-	[ "$(digest)" != "$plain" ] || fail "another volume than that of the geometry as it was told"
 	# A job that yields finds the same poses again, and ends with the same bits.
 	post_job "$recipe$iterations"
-	local yielded=$job
+	yielded=$job
 	until req GET "/v1/jobs/$job" && jq -e '.iteration >= 2' "$body" >/dev/null; do sleep 0.02; done
 	post_job "$recipe"'"fdk": {}, "priority": "stat"}'
 	wait_job succeeded
