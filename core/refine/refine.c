@@ -194,9 +194,10 @@ int refine_bytes(const struct reduced *reduced, size_t *ret_bytes, struct error 
 		size_t voxels, images;
 
 		count_floats(&fit, &voxels, &images);
-		*ret_bytes = bytes.volumes + bytes.scratch + bytes.raw + (voxels + images) * sizeof(float) +
-			     2 * backend->volume_bytes(NULL, &fit.grid) +
-			     2 * backend->stack_bytes(NULL, fit.geometry.columns, fit.geometry.rows, fit.geometry.count);
+		*ret_bytes =
+		    bytes.volumes + bytes.scratch + bytes.raw + (voxels + images) * sizeof(float) +
+		    2 * backend->volume_bytes(NULL, &fit.grid) +
+		    2 * backend->stack_bytes(NULL, fit.geometry.columns, fit.geometry.rows, fit.geometry.count);
 	}
 	fit_clear(&fit);
 	return code;
