@@ -22,6 +22,7 @@ const sentences = () => ({
 	'limit-of-bytes': t('There are as many bytes as there may be'),
 	'catalogue-away': t('The catalogue\'s database cannot be reached'),
 	'limit-reached': t('Who asks has as much as one may have'),
+	'elsewhere': t('Another host of the fleet has it'),
 	'unauthorized': t('The daemon does not know who asks'),
 	'forbidden': t('Another role is wanted for this'),
 	'foreign-origin': t('A page of another site may not do this'),

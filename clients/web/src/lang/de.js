@@ -568,6 +568,7 @@ export const strings = {
 	'There are as many bytes as there may be': 'Der Platz ist aufgebraucht, der zur Verfügung steht',
 	'The catalogue\'s database cannot be reached': 'Die Datenbank des Katalogs ist nicht erreichbar',
 	'Who asks has as much as one may have': 'Mehr steht Ihnen zurzeit nicht zu',
+	'Another host of the fleet has it': 'Ein anderer Rechner der Flotte hat es',
 	'The daemon does not know who asks': 'Der Dienst weiß nicht, wer fragt',
 	'Another role is wanted for this': 'Dafür ist eine andere Rolle nötig',
 	'A page of another site may not do this': 'Eine fremde Seite darf das nicht',
