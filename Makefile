@@ -192,7 +192,7 @@ $(BUILD)/cbctd-held: $(call objects,$(daemon_sources) tests/http/held.c tests/lo
 $(BUILD)/cbctd-without-postgresql: $(filter-out $(BUILD)/daemon/store/postgresql%,$(call objects,$(daemon_sources))) $(BUILD)/proto/openapi.o $(BUILD)/web/assets.o $(library)
 	$(call say,LINK)$(CC) $(LDFLAGS) -o $@ $^ $(call pkg,--libs,$(daemon_libs) $(proto_libs) $(core_libs)) $(LIBM)
 
-gpu_programs := $(BUILD)/gpu_check $(BUILD)/gpu_bench
+gpu_programs := $(BUILD)/gpu_check $(BUILD)/gpu_bench $(BUILD)/gpu_cards
 # Every program that a test or a benchmark runs, so that none stops compiling unseen.
 test-programs: $(addprefix $(BUILD)/,unit cbct-worker-held cbctd-held cbctd-without-postgresql manual faults.so every.so live_bytes.so simulated-nvml/libnvidia-ml.so.1 cpu-bench calibrate-bench agreement refine denoise presets stopping methods watchers slices acquire paper-project rabbitct) \
                $(if $(cuda_objects),$(gpu_programs) $(BUILD)/gpu_ceilings $(BUILD)/cbct-worker-faulty,$(call objects,$(wildcard tests/bench/gpu_*.c)))

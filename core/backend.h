@@ -140,6 +140,7 @@ struct plan_options {
 	bool no_samples;    /* linearise will not be asked for */
 	bool no_projection; /* neither project nor sart_iterate will be asked for: no scratch for them */
 	int resident;       /* slots of the stacks that are on the device beside the plan; 0: one for each view */
+	bool unbounded;     /* no bound of its own is kept beside the device's: a part of a job whose whole has one */
 };
 
 /* Bytes, known before anything is allocated. */

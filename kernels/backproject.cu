@@ -679,15 +679,15 @@ int backproject_views(struct plan *plan, const float *from, int first, int count
 	return parts ? update_volume(plan, use, volume, err) : 0;
 }
 
-int coverage_sum(struct plan *plan, int first, int count, struct error *err)
+int coverage_sum(struct plan *plan, int first, int count, float *to, struct error *err)
 {
 	cudaStream_t stream = plan->device->stream;
 
 	if (plan->options.matched)
-		return matched_coverage(plan, first, count, err);
-	CUDA_TRY(cudaMemsetAsync(plan->coverage, 0, grid_voxels(plan->options.grid) * sizeof(float), stream));
+		return matched_coverage(plan, first, count, to, err);
+	CUDA_TRY(cudaMemsetAsync(to, 0, grid_voxels(plan->options.grid) * sizeof(float), stream));
 	for (int done = 0; done < count; done += VIEWS_AT_ONCE) {
-		backprojection_job job = job_make(plan, plan->coverage, {});
+		backprojection_job job = job_make(plan, to, {});
 		dim3 blocks(divide_up(job.nx, 32), divide_up(job.ny, 8), job.nz);
 
 		job.views = count - done < VIEWS_AT_ONCE ? count - done : VIEWS_AT_ONCE;

@@ -349,6 +349,7 @@ struct plan {
 	cudaTextureObject_t sampled; /* and its texture */
 	float2 *partial; /* SART: squares of residuals and projections, one for each block of the forward projection */
 	size_t partial_count;
+	float2 *rays_partial;          /* the same of rays that are corrected by themselves, where there is no SART */
 	cudaEvent_t projected, summed; /* the last of them is there; all are summed up */
 	double *reduce;                /* partial sums of reductions, reduce_count of them */
 	float *matrices;               /* of the views in hand, on their way into constant memory */
@@ -474,7 +475,8 @@ enum { VIEWS_AT_ONCE = 1024 };
 int backproject_prepare(struct plan *plan, int first, int count, struct error *err);
 void backproject_forget(struct device *device);
 struct constants *backproject_constants(int gpu);
-int coverage_sum(struct plan *plan, int first, int count, struct error *err);
+/* Column sums of these views into `to`, [z][y][x]. */
+int coverage_sum(struct plan *plan, int first, int count, float *to, struct error *err);
 const char *backprojector_name(const struct plan *plan, bool fdk); /* of backprojectors[], or matched */
 
 /* ---- matched.cu ---- */
@@ -484,8 +486,8 @@ const char *backprojector_name(const struct plan *plan, bool fdk); /* of backpro
  */
 int matched_views(struct plan *plan, const float *from, int first, int count, struct voxel_use use, float *volume,
 		  struct error *err);
-/* -> coverage; takes the scratch */
-int matched_coverage(struct plan *plan, int first, int count, struct error *err);
+/* Column sums into `to`; takes the scratch. */
+int matched_coverage(struct plan *plan, int first, int count, float *to, struct error *err);
 size_t matched_scratch_bytes(const struct plan *plan); /* at least */
 
 /* ---- filter.cu ---- */
@@ -510,6 +512,10 @@ size_t reduce_count(void);
 /* partial[0 .. count - 1] -> sums[0], sums[1] += in a fixed order. */
 int reduce_pairs(struct plan *plan, const float2 *partial, size_t count, double *sums, cudaStream_t stream,
 		 struct error *err);
+
+/* ---- cards.cu ---- */
+/* Partial sums that sart_correct leaves of all views. */
+size_t rays_partials(const struct plan *plan);
 
 /* ---- by_view.cu: one or few views an update, by rows, from copies in half precision in scratch ---- */
 size_t copies_bytes(const struct plan *plan);
@@ -579,6 +585,16 @@ int cuda_project(struct plan *plan, const struct volume *from, const int *views,
 		 struct error *err);
 int cuda_sart_iterate(struct plan *plan, const struct stack *projections, struct volume *volume,
 		      const struct cancel *cancel, struct iteration_sums *ret_sums, struct error *err);
+int cuda_sart_correct(struct plan *plan, const struct geometry *geometry, const struct grid *grid,
+		      const struct stack *projections, const int *slots, const int *views, int count,
+		      struct stack *rays, struct iteration_sums *ret_sums, struct error *err);
+int cuda_sart_coverage(struct plan *plan, const int *views, int count, struct volume *to, struct error *err);
+int cuda_sart_update(const struct sart_options *options, double least, const struct volume *sums,
+		     const struct volume *coverage, struct volume *volume, struct error *err);
+bool cuda_connect(struct device *const devices[], int count);
+int cuda_stack_pass(const struct stack *from, const int *from_slots, int from_row, struct stack *to,
+		    const int *to_slots, int to_row, int rows, int count, bool add, struct error *err);
+int cuda_volume_pass(const struct volume *from, int z_from, struct volume *to, int z_to, int count, struct error *err);
 int cuda_tv(struct plan *plan, struct volume *volume, const struct tv_options *options, const struct cancel *cancel,
 	    struct error *err);
 int cuda_norms(struct plan *plan, const struct volume *volume, const struct volume *other, double unit,

@@ -244,9 +244,8 @@ int matched_views(struct plan *plan, const float *from, int first, int count, st
 	return launch_back(plan, job, err);
 }
 
-int matched_coverage(struct plan *plan, int first, int count, struct error *err)
+int matched_coverage(struct plan *plan, int first, int count, float *to, struct error *err)
 {
-	CUDA_TRY(
-	    cudaMemsetAsync(plan->coverage, 0, grid_voxels(plan->options.grid) * sizeof(float), plan->device->stream));
-	return add_views(plan, NULL, first, count, plan->coverage, err);
+	CUDA_TRY(cudaMemsetAsync(to, 0, grid_voxels(plan->options.grid) * sizeof(float), plan->device->stream));
+	return add_views(plan, NULL, first, count, to, err);
 }

@@ -551,6 +551,8 @@ static void plan_walk(struct plan *plan, struct arena *arena)
 	linearise_walk(plan, arena);
 	if (plan->strategy != NULL)
 		sart_walk(plan, arena);
+	else if (plan->options.no_projection)
+		take(arena, &plan->rays_partial, rays_partials(plan));
 	if (plan->options.column_weights != NULL)
 		filter_walk(plan, arena);
 }
@@ -593,7 +595,8 @@ static bool is_borrowed(const struct plan_options *options, size_t block)
  */
 static enum thrift choose_thrift(const struct device *device, const struct plan_options *options)
 {
-	size_t most = most_bytes(options), room = device != NULL ? device->limit - device->used : SIZE_MAX, least = 0;
+	size_t most = options->unbounded ? SIZE_MAX : most_bytes(options),
+	       room = device != NULL ? device->limit - device->used : SIZE_MAX, least = 0;
 	enum thrift best = THRIFT_LEAN;
 
 	for (int thrift = THRIFT_NONE; thrift <= THRIFT_LEAN; thrift++) {

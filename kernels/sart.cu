@@ -256,7 +256,7 @@ static int update_subset(struct plan *plan, int subset, const float *projections
 	voxels.coverage = plan->shape.covered ? NULL : plan->coverage;
 	voxels.least = plan->options.matched ? (float)COLUMN_SUM_LEAST * spacing_least(plan) : 0.0f;
 	if (!plan->shape.covered && plan->coverage_subset != subset) {
-		TRY(coverage_sum(plan, first, count, err));
+		TRY(coverage_sum(plan, first, count, plan->coverage, err));
 		plan->coverage_subset = sart->subsets.count > 1 ? -1 : subset;
 	}
 	TRY(plan->strategy->lay_out(plan, volume, err));
@@ -514,7 +514,7 @@ int cuda_sart_iterate(struct plan *plan, const struct stack *projections, struct
 		    plan->recorded_stack != projections->data) {
 			/* With one subset the column sums are made now and not again and again. */
 			if (plan->coverage != NULL && one && plan->coverage_subset != 0) {
-				TRY(coverage_sum(plan, 0, count, err));
+				TRY(coverage_sum(plan, 0, count, plan->coverage, err));
 				plan->coverage_subset = 0;
 			}
 			TRY(record(plan, projections->data, volume->data, err));

@@ -120,6 +120,7 @@ static int walk_plan(struct walk *walk, struct plan_options *options, struct pla
 	if (!walk->plans)
 		return 0;
 	options->beside = walk->beside;
+	options->unbounded = true;
 	if (!walk->measures)
 		return walk->backend->plan_new(walk->card, options, ret_plan, err);
 	code = walk->backend->plan_bytes(walk->card, options, &bytes, err);

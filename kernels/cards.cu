@@ -1,0 +1,292 @@
+/*
+ * What several cards of one job do for each other (core/cards/cards.h): they read each other's memory over NVLink or
+ * the bus, each on its own stream, in the order that work was asked for; and the parts of a SART iteration between two
+ * exchanges.
+ */
+#include "kernels/internal.cuh"
+
+static const int THREADS = 256;
+
+/* ---- from card to card ---- */
+
+static bool reach(const struct device *device, const struct device *other)
+{
+	int can = 0;
+
+	if (cudaDeviceCanAccessPeer(&can, device->index, other->index) != cudaSuccess || !can)
+		return false;
+	cudaError_t status = cudaDeviceEnablePeerAccess(other->index, 0);
+	if (status == cudaErrorPeerAccessAlreadyEnabled) {
+		cudaGetLastError();
+		return true;
+	}
+	return status == cudaSuccess;
+}
+
+bool cuda_connect(struct device *const devices[], int count)
+{
+	bool all = true;
+
+	for (int i = 0; i < count && all; i++) {
+		all = cudaSetDevice(devices[i]->index) == cudaSuccess;
+		for (int j = 0; j < count && all; j++)
+			all = j == i || reach(devices[i], devices[j]);
+	}
+	cudaGetLastError();
+	return all;
+}
+
+/*
+ * Behind what `reader` has read of `from`, which is marked by `written`: the card that has it goes on only then. Other
+ * cards may do the same at this moment. Each waits before it records, so that whoever records last has all waits before
+ * the mark.
+ */
+static int end_reading(struct device *owner, cudaEvent_t from, struct device *reader, cudaEvent_t written,
+		       struct error *err)
+{
+	if (owner == reader)
+		return mark_used(owner, from, err);
+	TRY(device_enter(owner, err));
+	CUDA_TRY(cudaStreamWaitEvent(owner->stream, written, 0));
+	TRY(mark_used(owner, from, err));
+	return device_enter(reader, err);
+}
+
+enum { PASS_MOST = 128 }; /* slots of a launch: they are among its arguments */
+struct pass_job {
+	const float4 *from;
+	float4 *to;
+	size_t from_slot, to_slot, count; /* float4 from slot to slot, and that are passed of each */
+	int from_slots[PASS_MOST], to_slots[PASS_MOST];
+};
+
+template <bool ADD>
+static __global__ void __launch_bounds__(THREADS) pass(const __grid_constant__ pass_job job)
+{
+	const float4 *from = job.from + (size_t)job.from_slots[blockIdx.y] * job.from_slot;
+	float4 *to = job.to + (size_t)job.to_slots[blockIdx.y] * job.to_slot;
+
+	for (size_t i = (size_t)blockIdx.x * THREADS + threadIdx.x; i < job.count; i += (size_t)gridDim.x * THREADS) {
+		float4 value = from[i];
+
+		if (ADD) {
+			float4 here = to[i];
+
+			value = make_float4(here.x + value.x, here.y + value.y, here.z + value.z, here.w + value.w);
+		}
+		to[i] = value;
+	}
+}
+
+int cuda_stack_pass(const struct stack *from, const int *from_slots, int from_row, struct stack *to,
+		    const int *to_slots, int to_row, int rows, int count, bool add, struct error *err)
+{
+	struct device *device = to->device;
+	const size_t pitch = (size_t)to->shape.pitch;
+	const int each = 16; /* blocks of a slot */
+
+	if (from->shape.pitch != to->shape.pitch || from_row + rows > from->shape.rows ||
+	    to_row + rows > to->shape.rows)
+		return error_set(err, ERR_INTERNAL, "%d rows to another card, of other stacks", rows);
+	TRY(device_enter(device, err));
+	CUDA_TRY(cudaStreamWaitEvent(device->stream, from->used, 0));
+	for (int done = 0; done < count; done += PASS_MOST) {
+		const int now = count - done < PASS_MOST ? count - done : PASS_MOST;
+		pass_job job = {};
+
+		job.from = (const float4 *)(from->data + pitch * (size_t)from_row);
+		job.to = (float4 *)(to->data + pitch * (size_t)to_row);
+		job.from_slot = from->shape.slot / 4;
+		job.to_slot = to->shape.slot / 4;
+		job.count = pitch * (size_t)rows / 4;
+		for (int i = 0; i < now; i++) {
+			job.from_slots[i] = from_slots[done + i];
+			job.to_slots[i] = to_slots[done + i];
+		}
+		if (add)
+			pass<true><<<dim3(each, now), THREADS, 0, device->stream>>>(job);
+		else
+			pass<false><<<dim3(each, now), THREADS, 0, device->stream>>>(job);
+		LAUNCHED();
+	}
+	TRY(mark_used(device, to->used, err));
+	return end_reading(from->device, from->used, device, to->used, err);
+}
+
+int cuda_volume_pass(const struct volume *from, int z_from, struct volume *to, int z_to, int count, struct error *err)
+{
+	struct device *device = to->device, *other = from->device;
+	const size_t slice = (size_t)to->size[0] * (size_t)to->size[1];
+
+	TRY(device_enter(device, err));
+	CUDA_TRY(cudaStreamWaitEvent(device->stream, from->used, 0));
+	CUDA_TRY(cudaMemcpyPeerAsync(to->data + slice * (size_t)z_to, device->index,
+				     from->data + slice * (size_t)z_from, other->index,
+				     slice * (size_t)count * sizeof(float), device->stream));
+	TRY(mark_used(device, to->used, err));
+	return end_reading(other, from->used, device, to->used, err);
+}
+
+/* ---- a SART iteration in parts ---- */
+
+struct correction_job {
+	const struct device_view *geometry;
+	const int *views, *slots; /* [count] */
+	float *rays;
+	const float *measured;
+	int columns, rows, pitch;
+	size_t slot;
+	float half[3], mm[3]; /* of the box from its centre, voxels; of a voxel */
+	float least;          /* mm */
+	float2 *partial;      /* [count][gridDim.x] */
+};
+
+/* mm of the ray that lie in the box; d from the source s to the pixel, voxels. */
+static __device__ __forceinline__ float length_inside(const correction_job &job, const float s[3], const float d[3])
+{
+	double begin = -INFINITY, end = INFINITY;
+	float length2 = 0;
+
+	for (int i = 0; i < 3; i++) {
+		float mm = d[i] * job.mm[i];
+
+		length2 = fmaf(mm, mm, length2);
+		if (d[i] == 0) {
+			if (fabsf(s[i]) > job.half[i])
+				return 0;
+			continue;
+		}
+		double inverse = 1.0 / (double)d[i], a = ((double)-job.half[i] - (double)s[i]) * inverse;
+		double b = ((double)job.half[i] - (double)s[i]) * inverse;
+
+		begin = fmax(begin, fmin(a, b));
+		end = fmin(end, fmax(a, b));
+	}
+	return end > begin ? (float)(end - begin) * sqrtf(length2) : 0.0f;
+}
+
+static __global__ void __launch_bounds__(THREADS) correct(const correction_job job)
+{
+	__shared__ float2 warps[THREADS / 32];
+	const struct device_view *view = job.geometry + job.views[blockIdx.y];
+	const float *measured = job.measured + (size_t)job.slots[blockIdx.y] * job.slot;
+	float *rays = job.rays + (size_t)blockIdx.y * job.slot;
+	float2 sum = make_float2(0, 0);
+
+	for (int i = blockIdx.x * THREADS + threadIdx.x; i < job.columns * job.rows; i += gridDim.x * THREADS) {
+		int column = i % job.columns, row = i / job.columns;
+		size_t at = (size_t)row * job.pitch + column;
+		float c = column - 0.5f * (job.columns - 1), r = row - 0.5f * (job.rows - 1), d[3], p = measured[at];
+
+		for (int k = 0; k < 3; k++)
+			d[k] = fmaf(view->direction[k][2], r, fmaf(view->direction[k][1], c, view->direction[k][0]));
+		float length = length_inside(job, view->source, d), difference = p - rays[at];
+		if (isnan(p)) /* RAY_LEFT_OUT */
+			p = difference = 0;
+		sum.x = fmaf(difference, difference, sum.x);
+		sum.y = fmaf(p, p, sum.y);
+		rays[at] = length > 0 && length >= job.least ? difference / length : 0.0f;
+	}
+	for (int lane = 16; lane > 0; lane >>= 1) {
+		sum.x += __shfl_down_sync(~0u, sum.x, lane);
+		sum.y += __shfl_down_sync(~0u, sum.y, lane);
+	}
+	if (threadIdx.x % 32 == 0)
+		warps[threadIdx.x / 32] = sum;
+	__syncthreads();
+	if (threadIdx.x > 0)
+		return;
+	for (int i = 1; i < THREADS / 32; i++) {
+		sum.x += warps[i].x;
+		sum.y += warps[i].y;
+	}
+	job.partial[(size_t)blockIdx.y * gridDim.x + blockIdx.x] = sum;
+}
+
+enum { CORRECT_BLOCKS = 64 }; /* of a view */
+
+size_t rays_partials(const struct plan *plan)
+{
+	return (size_t)plan->options.geometry->count * CORRECT_BLOCKS;
+}
+
+int cuda_sart_correct(struct plan *plan, const struct geometry *geometry, const struct grid *grid,
+		      const struct stack *projections, const int *slots, const int *views, int count,
+		      struct stack *rays, struct iteration_sums *ret_sums, struct error *err)
+{
+	const double *mm = grid->spacing;
+	struct device *device = plan->device;
+	correction_job job = {};
+
+	(void)geometry;
+	if (plan->rays_partial == NULL)
+		return error_set(err, ERR_INTERNAL, "the plan was made without corrections of rays");
+	TRY(device_enter(device, err));
+	TRY(plan_check_views(plan, views, count, &plan->stack, rays, count, err));
+	TRY(plan_set_views(plan, views, count, err));
+	TRY(plan_set_slots(plan, slots, count, projections, err));
+	job.geometry = plan->geometry;
+	job.views = plan->views;
+	job.slots = plan->slots;
+	job.rays = rays->data;
+	job.measured = projections->data;
+	job.columns = plan->stack.columns;
+	job.rows = plan->stack.rows;
+	job.pitch = plan->stack.pitch;
+	job.slot = plan->stack.slot;
+	for (int i = 0; i < 3; i++) {
+		job.half[i] = 0.5f * (float)grid->size[i];
+		job.mm[i] = (float)mm[i];
+	}
+	job.least = (float)(RAY_LENGTH_LEAST * fmin(fmin(mm[0], mm[1]), mm[2]));
+	job.partial = plan->rays_partial;
+	correct<<<dim3(CORRECT_BLOCKS, count), THREADS, 0, device->stream>>>(job);
+	LAUNCHED();
+	TRY(reduce_pairs(plan, job.partial, (size_t)count * CORRECT_BLOCKS, device->sums_device, device->stream, err));
+	TRY(mark_used(device, projections->used, err));
+	TRY(mark_used(device, rays->used, err));
+	TRY(device_wait(device, err));
+	*ret_sums = {device->sums[0], device->sums[1]};
+	return 0;
+}
+
+int cuda_sart_coverage(struct plan *plan, const int *views, int count, struct volume *to, struct error *err)
+{
+	TRY(device_enter(plan->device, err));
+	if (plan->shape.covered)
+		return cuda_volume_fill(to, (float)count, err);
+	TRY(plan_set_views(plan, views, count, err));
+	TRY(coverage_sum(plan, 0, count, to->data, err));
+	return mark_used(plan->device, to->used, err);
+}
+
+static __global__ void __launch_bounds__(THREADS)
+    update(const float *__restrict__ sums, const float *__restrict__ coverage, float *volume, size_t count,
+	   float relaxation, float least, bool nonnegative)
+{
+	size_t i = (size_t)blockIdx.x * THREADS + threadIdx.x;
+
+	if (i >= count)
+		return;
+	float cover = coverage[i];
+	if (!(cover > 0))
+		return;
+	float value = fmaf(relaxation, sums[i] / fmaxf(cover, least), volume[i]);
+	volume[i] = nonnegative && cover > least && value < 0 ? 0.0f : value;
+}
+
+int cuda_sart_update(const struct sart_options *options, double least, const struct volume *sums,
+		     const struct volume *coverage, struct volume *volume, struct error *err)
+{
+	struct device *device = volume->device;
+	size_t count = volume->bytes / sizeof(float);
+
+	TRY(device_enter(device, err));
+	update<<<(unsigned)((count + THREADS - 1) / THREADS), THREADS, 0, device->stream>>>(
+	    sums->data, coverage->data, volume->data, count, (float)options->relaxation, (float)least,
+	    options->nonnegative);
+	LAUNCHED();
+	TRY(mark_used(device, sums->used, err));
+	TRY(mark_used(device, coverage->used, err));
+	return mark_used(device, volume->used, err);
+}
