@@ -144,6 +144,16 @@ static void run_project(struct bench *bench)
 	     &err, "project");
 }
 
+static void run_backproject(struct bench *bench)
+{
+	struct error err = {0};
+
+	must(bench->backend->volume_fill(bench->volume, 0, &err), &err, "fill");
+	must(bench->backend->backproject(bench->plan, bench->projections, bench->views, bench->scene->geometry.count,
+					 BACKPROJECT_PLAIN, bench->volume, &err),
+	     &err, "backproject");
+}
+
 static const struct tv_options tv_options = {
     .method = TV_PROXIMAL, .alpha = .1, .step = .1, .iterations = 8, .unit = 1};
 
@@ -162,6 +172,7 @@ static const struct {
 	void (*run)(struct bench *bench);
 } rows[] = {
     {"forward projection", 0, false, false, false, run_project},
+    {"plain backprojection", 0, false, false, false, run_backproject},
     {"FDK", 0, false, false, false, run_fdk},
     {"SIRT iteration", 1, false, false, false, run_sart},
     {"OS-SART iteration, 10", 10, false, false, false, run_sart},
@@ -300,7 +311,7 @@ static void time_case(char letter, const struct scene_options *options, const in
 			if (letter == 'E' && rows[row].small_only)
 				continue;
 			begin_row(&bench, row);
-			if (row == 1)
+			if (row == 2)
 				printf("%c: %s\n", letter, bench.backend->plan_summary(bench.plan));
 			ms = milliseconds_of(&bench, rows[row].run);
 			if (n == 1)
