@@ -31,6 +31,7 @@
 #include "proto/heartbeat.h"
 #include "proto/json.h"
 #include "proto/scan_directory.h"
+#include "proto/scatter_file.h"
 #include "proto/sums.h"
 
 enum { RUN_BYTES = 4 << 20, LOOK_MS = 20, VOLUMES_MOST = 4096 };
@@ -180,6 +181,51 @@ static size_t bytes_of_image(const struct remote *remote, int image)
 	return image_bytes(image, geometry->columns, geometry->rows);
 }
 
+/* Goes over the images of scatter, of a scan that has all it announces: sends each, or makes their digest. */
+static int go_over_scatter(struct remote *remote, bool sends, struct error *err)
+{
+	const struct scan *scan = remote->files.scan;
+	const struct scatter_images *images = &scan->scatter.images;
+	const size_t bytes = scatter_image_bytes(images);
+	struct scatter_file file;
+	uint8_t *sha256 = NULL;
+	float *pixels = NULL;
+	bool whole;
+	int code;
+
+	if (images->columns == 0)
+		return 0;
+	code = scatter_file_open(remote->start->scan_directory, images, scan->count, false, &file, &whole, err);
+	if (code != 0)
+		return code;
+	sha256 = calloc((size_t)file.count, DIGEST_BYTES);
+	pixels = malloc(bytes);
+	if (sha256 == NULL || pixels == NULL)
+		code = error_set(err, ERR_NO_MEMORY, "no memory for images of scatter");
+	else if (file.sums < 0)
+		code = error_set(err, ERR_DAMAGED, "the scan has no " SUMS_SCATTER_FILE);
+	for (int i = 0; i < file.count && code == 0; i++) {
+		char path[160];
+		struct sum sum;
+
+		pulse_beat();
+		code = scatter_file_read(&file, i, pixels, &sum, err);
+		if (code != 0)
+			break;
+		memcpy(sha256 + (size_t)i * DIGEST_BYTES, sum.sha256, DIGEST_BYTES);
+		snprintf(path, sizeof(path), "/v1/scans/%.63s/scatter/%d", remote->scan,
+			 scatter_image_projection(images, scan->count, i));
+		if (sends)
+			code = put(remote, path, pixels, bytes, err);
+	}
+	if (code == 0 && !sends)
+		code = digest_projections(sha256, file.count, remote->source.scatter, err);
+	scatter_file_close(&file);
+	free(sha256);
+	free(pixels);
+	return code;
+}
+
 static int know_source(struct remote *remote, struct error *err)
 {
 	struct remote_source *source = &remote->source;
@@ -195,7 +241,7 @@ static int know_source(struct remote *remote, struct error *err)
 			code = digest_of(remote->files.image[i], bytes_of_image(remote, i), source->image[i], err);
 	}
 	snprintf(source->scan_name, sizeof(source->scan_name), "%s", remote->files.scan->name);
-	return code;
+	return code == 0 ? go_over_scatter(remote, false, err) : code;
 }
 
 /* Known once all of them were sent: a scan that is still acquired has no digest yet. */
@@ -230,11 +276,12 @@ static int know_projections(struct remote *remote, struct error *err)
 static int name_scan(const struct remote *remote, char ret_name[120], char ret_key[200], struct error *err)
 {
 	const char *claim = remote->options->claim;
-	char digests[(IMAGE_COUNT + 1) * DIGEST_TEXT_MAX], digest[DIGEST_TEXT_MAX];
+	char digests[(IMAGE_COUNT + 2) * DIGEST_TEXT_MAX], digest[DIGEST_TEXT_MAX];
 	int length = snprintf(digests, sizeof(digests), "%s", remote->source.scan);
 
 	for (int i = 0; i < IMAGE_COUNT; i++)
 		length += snprintf(digests + length, sizeof(digests) - (size_t)length, "%s", remote->source.image[i]);
+	length += snprintf(digests + length, sizeof(digests) - (size_t)length, "%s", remote->source.scatter);
 	snprintf(ret_name, 120, "%.*s/%.16s", (int)strcspn(claim, "/"), claim, remote->start->request.scan);
 	if (digest_of(digests, (size_t)length, digest, err) != 0)
 		return err->code;
@@ -285,6 +332,8 @@ static int post_scan(struct remote *remote, struct error *err)
 		if (remote->files.image[i] != NULL)
 			code = put(remote, path, remote->files.image[i], bytes_of_image(remote, i), err);
 	}
+	if (code == 0)
+		code = go_over_scatter(remote, true, err);
 	return code == 0 ? know_those_there(remote, err) : code;
 }
 

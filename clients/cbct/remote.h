@@ -11,6 +11,7 @@
 struct remote_source {
 	char scan[DIGEST_TEXT_MAX], projections[DIGEST_TEXT_MAX], recipe[DIGEST_TEXT_MAX];
 	char image[IMAGE_COUNT][DIGEST_TEXT_MAX]; /* "" where there is none */
+	char scatter[DIGEST_TEXT_MAX];            /* over its images of scatter; "" where there are none */
 	char scan_name[SCAN_NAME_BYTES];
 };
 

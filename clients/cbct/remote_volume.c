@@ -28,6 +28,8 @@ static int check_source(const struct provenance *theirs, const struct remote_sou
 		code = must_be("projections", source->projections, theirs->projections_digest, err);
 	if (code == 0)
 		code = must_be("recipe", source->recipe, theirs->recipe_digest, err);
+	if (code == 0)
+		code = must_be("scatter", source->scatter, theirs->scatter_digest, err);
 	for (int i = 0; i < IMAGE_COUNT && code == 0; i++)
 		code = must_be(image_kinds[i].name, source->image[i], theirs->image_digest[i], err);
 	return code;

@@ -56,7 +56,8 @@ static void add_arriving(struct job *job, double since, struct job_offer *ret_of
 	*offer = (struct job_offer){
 	    .priority = job->record.priority, .where = job->request.where, .elsewhere = job->entry.elsewhere};
 	pthread_mutex_unlock(&job->jobs->lock);
-	if (!may || !job_attendable(job, &facts) || facts.arrived <= since)
+	/* Images of scatter go with the scan, before its projections. */
+	if (!may || !job_attendable(job, &facts) || facts.arrived <= since || facts.scatter.wanted > 0)
 		return;
 	memcpy(offer->id, job->id, sizeof(job->id));
 	memcpy(offer->scan, job->scan, sizeof(job->scan));

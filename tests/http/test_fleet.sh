@@ -174,6 +174,32 @@ test_counts_with_their_images_and_a_patient_who_stays_at_home() {
 	! grep -rqE 'Doe|4711|secret' "$work/a" "$work/a.err" || fail "nothing of the patient on another host: $(grep -rlE 'Doe|4711|secret' "$work/a" "$work/a.err")"
 }
 
+test_images_of_scatter_go_along() {
+	begin
+	cbct simulate -o "$work/scattered" --phantom head --scale 70 --views 30 --columns 48 --rows 36 --pixel 7 --raw air >/dev/null
+	jq '.projections.scatter = {"kind": "images", "columns": 8, "rows": 6, "every": 12}' "$work/scattered/scan.json" >"$work/announced.json"
+	mv "$work/announced.json" "$work/scattered/scan.json"
+	python3 -c 'import array, sys; array.array("f", [300 + i % 48 for i in range(4 * 48)]).tofile(sys.stdout.buffer)' >"$work/scattered/scatter.raw"
+	start_daemon --threads 1
+	scan=$(cbct upload --quiet --url "$url" "$work/scattered")
+	post_job "$small"
+	wait_job succeeded
+	get_volume final "$work/scattered.raw" format=raw
+	req GET "/v1/jobs/$job/volumes/final/provenance"
+	jq .images "$body" >"$work/scattered.images"
+	stop_daemon
+	taker a
+	owner c
+	at c
+	scan=$(cbct upload --quiet --url "$url" "$work/scattered")
+	post_job "$small"
+	wait_job succeeded 60
+	same_bits scattered
+	req GET "/v1/jobs/$job/volumes/final/provenance"
+	jq .images "$body" | cmp - "$work/scattered.images" || fail "the same images"
+	nothing_left a
+}
+
 test_a_zombie_is_not_heard() {
 	begin
 	undisturbed "$scan_dir" "$long" long
