@@ -1,4 +1,4 @@
-/* Images between two sizes of detail, and medians: see detail.h. */
+/* Images between two sizes of detail: see detail.h. */
 #include "core/refine/detail.h"
 
 #include <math.h>
@@ -43,36 +43,4 @@ void image_detail(const float *from, int columns, int rows, double fine, double 
 	image_smooth(from, columns, rows, coarse, work, wide);
 	for (size_t i = 0; i < pixels; i++)
 		ret_to[i] = narrow[i] - wide[i];
-}
-
-/* By Hoare (1961). */
-double median_of(float *values, int count)
-{
-	int low = 0, high = count - 1;
-	const int wanted = count / 2;
-
-	while (low < high) {
-		const float pivot = values[(low + high) / 2];
-		int i = low, j = high;
-
-		while (i <= j) {
-			while (values[i] < pivot)
-				i++;
-			while (values[j] > pivot)
-				j--;
-			if (i <= j) {
-				const float value = values[i];
-
-				values[i++] = values[j];
-				values[j--] = value;
-			}
-		}
-		if (wanted <= j)
-			high = j;
-		else if (wanted >= i)
-			low = i;
-		else
-			break;
-	}
-	return (double)values[wanted];
 }

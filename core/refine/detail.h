@@ -10,7 +10,4 @@ void image_smooth(const float *from, int columns, int rows, double sigma, float 
 /* The difference of two Gaussians; ret_to may be `from`. work: three images. */
 void image_detail(const float *from, int columns, int rows, double fine, double coarse, float *work, float *ret_to);
 
-/* The value that half of the others are below; changes their order. */
-double median_of(float *values, int count);
-
 #endif

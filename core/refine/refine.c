@@ -10,6 +10,7 @@
 #endif
 
 #include "core/refine/detail.h"
+#include "core/select.h"
 
 enum { VIEWS_LEAST = 48, BINS_LEAST = 24, HELD_OUT = 8, SUBSETS = 10, EDGE = 4, IMAGES = 1 + PATH_NUMBERS };
 /* Iterations before the first step; steps with the same knots; how often these are doubled. */
@@ -388,7 +389,7 @@ static void add_up_view(struct fit *fit, int view)
 	for (int row = EDGE; row < rows - EDGE; row++)
 		for (int column = EDGE; column < columns - EDGE; column++)
 			scratch[count++] = fabsf(images[row * columns + column]);
-	cut = 3 * MAD * median_of(scratch, count) + 1e-9;
+	cut = 3 * MAD * (double)select_kth(scratch, count, count / 2) + 1e-9;
 	for (int row = EDGE; row < rows - EDGE; row++)
 		for (int column = EDGE; column < columns - EDGE; column++) {
 			const float *pixel = images + row * columns + column;

@@ -10,6 +10,7 @@
 #include <string.h>
 
 #include "core/refine/detail.h"
+#include "core/select.h"
 
 /* The edge's last value, repeated, makes detail as far as BORDER, which may be that of a body wider than the image. */
 enum { UNKNOWNS = 5, PASSES = 4, EDGE = 3, BORDER = 8 };
@@ -191,7 +192,7 @@ static bool fit(const struct pair *pair, struct image_shift *ret_shift)
 		for (int i = 0; i < UNKNOWNS; i++)
 			for (int j = 0; j < UNKNOWNS; j++)
 				unknowns[i] += normal.matrix[i][j] * normal.right[j];
-		cut = TUKEY * MAD * median_of(pair->work, count) + 1e-12;
+		cut = TUKEY * MAD * (double)select_kth(pair->work, count, count / 2) + 1e-12;
 	}
 	for (int a = 0; a < 2; a++) {
 		ret_shift->bins[a] = unknowns[a];
