@@ -31,7 +31,8 @@ int job_checkpoint_open(struct job *job, int *ret_file, int *ret_iteration, stru
 	return code;
 }
 
-static int write_piece(int file, long piece, const void *data, size_t length, struct error *err)
+/* What has come of the checkpoint is in no count of bytes, so that the limits are asked for all of it. */
+static int write_piece(const struct job *job, int file, long piece, const void *data, size_t length, struct error *err)
 {
 	const off_t first = (off_t)piece * CHECKPOINT_PIECE;
 	struct stat status;
@@ -42,6 +43,8 @@ static int write_piece(int file, long piece, const void *data, size_t length, st
 	if (status.st_size < first)
 		return error_set(err, ERR_CONFLICT, "piece %ld came, expected is piece %lld", piece,
 				 (long long)(status.st_size / CHECKPOINT_PIECE));
+	if (store_check_bytes(job->jobs->store, job->record.client, (unsigned long long)first + length, err) != 0)
+		return err->code;
 	written = pwrite(file, data, length, first);
 	if (written < 0 || (size_t)written < length)
 		return error_set_errno(err, written < 0 ? errno : ENOSPC, "checkpoint");
@@ -92,8 +95,8 @@ int job_checkpoint_take(struct job *job, long piece, const void *data, size_t le
 		code = directory_make(directory, err);
 	if (code == 0) {
 		file = open(given, O_RDWR | O_CREAT | O_CLOEXEC, 0640);
-		code =
-		    file < 0 ? error_set_errno(err, errno, "checkpoint") : write_piece(file, piece, data, length, err);
+		code = file < 0 ? error_set_errno(err, errno, "checkpoint")
+				: write_piece(job, file, piece, data, length, err);
 	}
 	if (code == 0 && last)
 		code = begin_with(job, file, given, directory, err);

@@ -155,6 +155,40 @@ test_bytes_are_taken_when_they_come() {
 	done
 }
 
+# A checkpoint that comes from another host has no more room than anything else.
+test_pieces_of_a_checkpoint_keep_within_the_limits() {
+	local piece=$((4 << 20))
+	limited --client-bytes $((bytes + piece + 100000))
+	new_scan 201
+	fill 201
+	head -c $piece /dev/zero >"$work/piece"
+	ask POST '/v1/jobs?resume=2' -H 'Content-Type: application/json' --data-binary "{\"scan\": \"$scan\", $grid, \"sart\": {\"iterations\": 4}}"
+	expect_status 202
+	expect_json '.state == "waiting" and .waiting_for == ["checkpoint"]'
+	job=$(json .id)
+	ask PUT "/v1/jobs/$job/checkpoint/1" -T "$work/piece"
+	expect_problem 409
+	head -c $((piece + 1)) /dev/zero >"$work/large"
+	ask PUT "/v1/jobs/$job/checkpoint/0" -T "$work/large"
+	expect_problem 413
+	ask PUT "/v1/jobs/$job/checkpoint/0" -T "$work/piece"
+	expect_status 204
+	ask PUT "/v1/jobs/$job/checkpoint/0" -T "$work/piece"
+	expect_status 204
+	ask PUT "/v1/jobs/$job/checkpoint/1" -T "$work/piece"
+	expect_problem 507
+	expect_json '.type == "urn:cbctd:problem:limit-of-bytes"'
+	ask PUT "/v1/jobs/$job/checkpoint/1" -H 'Content-Type: application/octet-stream' --data-binary ''
+	expect_problem 400
+	ask GET "/v1/jobs/$job"
+	expect_json '.waiting_for == ["checkpoint"]'
+	ask DELETE "/v1/jobs/$job"
+	expect_status 202
+	ask PUT "/v1/jobs/$job/checkpoint/0" -T "$work/piece"
+	expect_problem 409
+	[ "$(du -sk "$state/jobs" | cut -f1)" -lt 1000 ] || fail "the pieces go with the job: $(find "$state/jobs" -type f)"
+}
+
 test_volumes_leave_room_for_acquisition() {
 	# Nine tenths of it are this scan and two volumes, kept by one job; the whole is room for another scan.
 	limited --max-bytes $((2 * bytes + 40000))
