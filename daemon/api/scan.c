@@ -1,7 +1,25 @@
 /* /v1/scans */
 #include <stdio.h>
+#include <string.h>
 
 #include "daemon/api/filter.h"
+
+/*
+ * By such a name a taker of a fleet knows the scans that owners have brought it, which it removes when nobody needs
+ * them any more: no other scan may have one. Owners bring the name in the key, too.
+ */
+static int check_name(struct request *request, const struct scan *scan, struct error *err)
+{
+	const char *key = request_header(request, "Idempotency-Key");
+
+	if (strncmp(scan->name, JOB_MIRROR_KEY, strlen(JOB_MIRROR_KEY)) != 0 ||
+	    (key != NULL && strncmp(key, scan->name, strlen(scan->name)) == 0))
+		return 0;
+	return error_set_at(err, ERR_IMPOSSIBLE, "/name",
+			    "\"%.40s\": names that begin with \"" JOB_MIRROR_KEY
+			    "\" are those of scans that hosts of a fleet bring each other",
+			    scan->name);
+}
 
 /* A new scan, or the one that another request with the same key has made at the same time. */
 static int post(struct api *api, struct request *request, const struct store_key *key, struct stored_scan **ret_scan,
@@ -18,7 +36,9 @@ static int post(struct api *api, struct request *request, const struct store_key
 
 	if (scan_parse_calibrated(text, length, &calibrations, &scan, err) != 0)
 		return err->code;
-	code = store_scan_create(api->store, scan, client, key->text != NULL ? key : NULL, ret_scan, err);
+	code = check_name(request, scan, err);
+	if (code == 0)
+		code = store_scan_create(api->store, scan, client, key->text != NULL ? key : NULL, ret_scan, err);
 	if (code != 0)
 		scan_free(scan);
 	return code == ERR_CONFLICT ? store_scan_repeat(api->store, key, ret_scan, err) : code;

@@ -39,6 +39,16 @@ test_document_says_what_was_understood() {
 	expect_json '[.warnings[] | select(.code | test("arc"))] | length == 1'
 }
 
+# By such a name a taker of a fleet would take it for another host's, and remove it.
+test_a_name_of_the_fleet_is_refused() {
+	scan_json '.name = "fleet:gpu1/1m7yaj2sssx8c7cg"' >"$work/fleet.json"
+	req POST /v1/scans -H 'Content-Type: application/json' --data-binary "@$work/fleet.json"
+	expect_problem 422
+	expect_json '.pointer == "/name" and (.detail | contains("hosts of a fleet"))'
+	req POST /v1/scans -H 'Content-Type: application/json' -H 'Idempotency-Key: fleet:gpu2/other' --data-binary "@$work/fleet.json"
+	expect_problem 422
+}
+
 test_idempotency_key_of_a_scan() {
 	local first n pids=()
 	scan_json >"$work/scan.json"
