@@ -40,21 +40,37 @@ start_in_group() { # OPTION ...: the daemon is in the group, and this shell is n
 	start_daemon "$@"
 	echo $BASHPID >"$home/cgroup.procs"
 }
-# starve: takes the group's memory until its worker is gone, and gives it back
+# starve: takes the group's memory until its worker has ended, and gives it back
 starve() {
-	local worker
+	local worker i
 	worker=$(worker_of)
 	echo 1000 >"/proc/$worker/oom_score_adj" # it is the kernel's choice, and not who takes the memory
-	(
-		echo $BASHPID >"$group/cgroup.procs"
-		exec /usr/bin/python3 -c 'import os, sys, time
+	for i in 1 2 3; do
+		(
+			echo $BASHPID >"$group/cgroup.procs"
+			exec /usr/bin/python3 -c 'import os, sys, time
+def ended():  # whether its parent has come to know of it, or not yet
+    try:
+        return open("/proc/" + sys.argv[1] + "/stat").read().rpartition(") ")[2][0] in "ZX"
+    except OSError:
+        return True
 taken = []
-end = time.monotonic() + 60
-while os.path.exists("/proc/" + sys.argv[1]) and time.monotonic() < end:
+end = time.monotonic() + 20
+while not ended() and time.monotonic() < end:
     taken.append(bytearray(1 << 20))
     time.sleep(0.001)' "$worker"
-	) || true # the kernel may take both
-	! [ -e "/proc/$worker" ] || fail "the kernel ends worker $worker"
+		) || true # the kernel may take both, where the worker gives its memory back slowly
+		gone_within "$worker" 5 && return
+	done
+	fail "the kernel ends worker $worker"
+}
+gone_within() { # PID SECONDS
+	local i
+	for ((i = 0; i < $2 * 20; i++)); do
+		[ -e "/proc/$1" ] || return 0
+		sleep 0.05
+	done
+	return 1
 }
 
 test_a_job_that_does_not_fit_into_the_group_is_refused() {
