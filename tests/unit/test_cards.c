@@ -76,6 +76,7 @@ static const struct {
     {"seen in part", &displaced, false, &algorithm_sart, 3, -1, false, false, false, 1e-5},
     {"TV by steps", &full, true, &algorithm_sart, 4, TV_GRADIENT, false, false, false, 1e-4},
     {"proximal TV", &full, true, &algorithm_sart, 4, TV_PROXIMAL, false, false, false, 1e-4},
+    {"TGV", &full, true, &algorithm_sart, 4, TV_GENERALISED, false, false, false, 1e-4},
     {"momentum and TV", &full, true, &algorithm_sart, 4, TV_OF_THE_NOISE, false, true, false, 1e-4},
     {"CGLS", &full, true, &algorithm_cgls, 0, -1, true, false, false, 1e-4},
     {"CGLS and TV", &full, false, &algorithm_cgls, 0, TV_PROXIMAL, true, false, false, 1e-4},
