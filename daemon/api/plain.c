@@ -22,7 +22,7 @@ static const char style[] =
     "border-bottom:1px solid color-mix(in srgb,currentColor 20%,transparent)}"
     ".planes{display:flex;flex-wrap:wrap;gap:.5rem}"
     ".planes img{background:#000;max-width:100%;min-width:12rem;flex:1 1 12rem;object-fit:contain}"
-    "nav a,p a{margin-right:.8rem}"
+    "nav a,p a{margin-right:.8rem}time{white-space:nowrap}"
     "@media(pointer:coarse){a{display:inline-flex;align-items:center;min-width:44px;min-height:44px}}";
 
 static const struct preset {
@@ -124,6 +124,13 @@ static void put_state(FILE *out, const cJSON *job)
 		fprintf(out, ", %.0f s left", number_of(job, "eta_s"));
 }
 
+/* "2026-11-27T03:57:00.714Z" as people write it. */
+static void put_minute(FILE *out, const char *time)
+{
+	if (strlen(time) >= strlen("2026-11-27T03:57"))
+		fprintf(out, "<time>%.10s %.5s UTC</time>", time, time + 11);
+}
+
 /* ---- the jobs ---- */
 
 static void put_job_row(FILE *out, struct api *api, struct job *job)
@@ -138,7 +145,7 @@ static void put_job_row(FILE *out, struct api *api, struct job *job)
 	fputs("</a></td><td>", out);
 	put_state(out, document);
 	fputs("</td><td>", out);
-	put_text(out, text_of(document, "created"));
+	put_minute(out, text_of(document, "created"));
 	fputs("</td></tr>\n", out);
 	cJSON_Delete(document);
 }

@@ -148,6 +148,7 @@ test('light or dark and the language are chosen, and stay chosen; the pictures a
 	expect(await page.getAttribute('html', 'lang') === 'de', 'the browser\'s language')
 	expect(await badge(page).then(text => text.includes('fertig')), 'its words')
 	expect(await ground() > 200, 'a light ground')
+	expect(/^x −?\d+,\d  y/.test(await page.textContent('.readout')), `its decimals, got ${await page.textContent('.readout')}`)
 	await shoot(page, 'german')
 	await page.click('button.theme')
 	expect(await ground() < 60, 'a dark ground')
@@ -756,7 +757,12 @@ test('two iterations side by side and under a swipe', async () => {
 	await page.evaluate(() => new Promise(resolve => requestAnimationFrame(() => requestAnimationFrame(resolve))))
 	const other = await page.locator(`${tile('z')} .frame`).screenshot()
 	expect(!alone.equals(other), 'the other volume')
+	expect(grayOf(await page.locator(`${tile('z')} .scale-bar`).screenshot()).pixels.some(value => value > 180), 'the bar of known length above both')
+	const named = () => page.$$eval('[data-plane=z] .what', all => all.map(one => one.clientWidth > 20 ? one.textContent : ''))
+	expect(String(await named()) === ',iter-2 · SART 2 + TV', `the name of the one that is seen, got ${await named()}`)
 	await page.locator('input.swipe').fill('500')
+	await until('each named on its side', named, names => String(names) === 'final · SART 7 + TV,iter-2 · SART 2 + TV')
+	await readable(page, 'the swipe')
 	await page.waitForSelector('.viewer.second [data-plane="3d"][data-shown=iter-2]')
 	await shoot(page, 'swipe')
 	const box = await page.locator(tile('y')).boundingBox()
@@ -789,6 +795,7 @@ test('another job and a file from disk are compared in mm, whatever their grids'
 		}
 	}
 	await alike('another job')
+	await readable(page, 'another job')
 	await shoot(page, 'compare-job')
 	await page.context().close()
 	/* Files of a job with other axes: in 1/mm, and in HU and packed. */
@@ -911,6 +918,8 @@ test('"reconstruct again" shows what is wrong at its field, then posts a job', a
 	const described = await page.getAttribute(field('/sart/iterations'), 'aria-describedby')
 	expect(/expected/.test(await page.textContent(`#${described}`)), 'what was expected')
 	expect(await page.evaluate(() => document.activeElement.name) === '/sart/iterations', 'the focus at the field')
+	const [wrong, buttons] = await Promise.all([`#${described}`, 'dialog .job-form > .row.end'].map(selector => page.locator(selector).boundingBox()))
+	expect(wrong.y > 0 && wrong.y + wrong.height <= buttons.y, `the sentence in sight above the buttons, got ${wrong.y} to ${wrong.y + wrong.height} of ${buttons.y}`)
 	await shoot(page, 'reconstruct-again')
 	await page.fill(field('/sart/iterations'), '2')
 	await page.fill(field('/grid/spacing_mm/1'), 'wide')

@@ -104,21 +104,18 @@ export class Others {
 		const [kind, name] = this.#value.split(' ')
 		if (kind === 'file') {
 			viewer.showGrid(this.#file.name, this.#file.grid)
-			viewer.tag.textContent = this.#file.name
 			viewer.setWhat(this.#file.name)
 			return
 		}
 		if (kind === 'volume') {
 			const volume = this.#volumes.find(one => one.name === name)
 			viewer.show(this.job().id, volume)
-			viewer.tag.textContent = name
 			viewer.setWhat(whatOf(volume))
 			return
 		}
 		const text = this.#jobs.find(job => job.id === name).text
 		const volume = (await listVolumes(id(name), signal)).at(-1)
 		viewer.show(name, volume, true)
-		viewer.tag.textContent = text
-		viewer.setWhat(`${text} · ${volume.name}`)
+		viewer.setWhat(`${volume.name} · ${text}`)
 	}
 }

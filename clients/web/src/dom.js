@@ -59,10 +59,14 @@ export function number(value, digits = 3) {
 	const size = Math.abs(value)
 	if (size !== 0 && (size < 1e-3 || size >= 1e6)) {
 		const [mantissa, exponent] = value.toExponential(digits - 1).split('e')
-		return `${mantissa.replace('-', '−')} × 10${superscript(Number(exponent))}`
+		return `${fixed(Number(mantissa), digits - 1)} × 10${superscript(Number(exponent))}`
 	}
 	return value.toLocaleString(language(), { maximumSignificantDigits: digits, useGrouping: size >= 1e4 }).replace('-', '−')
 }
+
+/* With so many places behind the point, which is a comma in other languages. */
+export const fixed = (value, places = 1) =>
+	value.toLocaleString(language(), { minimumFractionDigits: places, maximumFractionDigits: places, useGrouping: false }).replace(/^-/, '−')
 
 const superscripts = '⁰¹²³⁴⁵⁶⁷⁸⁹'
 export function superscript(exponent) {
@@ -74,7 +78,7 @@ export function duration(seconds) {
 	if (seconds === null || seconds === undefined || !Number.isFinite(seconds))
 		return '–'
 	if (seconds < 10)
-		return `${seconds < 1 ? seconds.toFixed(1) : Math.round(seconds)} s`
+		return `${seconds < 1 ? fixed(seconds) : Math.round(seconds)} s`
 	if (seconds < 60)
 		return `${Math.round(seconds)} s`
 	const whole = Math.round(seconds)
@@ -103,8 +107,11 @@ export function moment(text) {
 		: `${date.toLocaleDateString(language() === 'en' ? [] : language(), { day: 'numeric', month: 'short', year: date.getFullYear() === today.getFullYear() ? undefined : 'numeric' })} ${time}`
 }
 
+/* Day and time, to the second. */
+export const fullTime = text => new Date(text).toLocaleString(language() === 'en' ? [] : language())
+
 export function timeElement(text) {
-	return h('time', { datetime: text ?? '', title: text ? new Date(text).toLocaleString() : '' }, moment(text))
+	return h('time', { datetime: text ?? '', title: text ? fullTime(text) : '' }, moment(text))
 }
 
 /* ---- how often ---- */

@@ -220,6 +220,7 @@ export class JobForm {
 		if (this.expert.contains(found.input))
 			this.expert.open = true
 		found.input.focus()
+		found.input.closest('.field')?.scrollIntoView({ block: 'nearest' }) /* with what is wrong below it */
 	}
 }
 

@@ -1,5 +1,5 @@
 /* A job's page: its volumes as they come, and everything about how they came. */
-import { h, replace, write, throttle, newId, bytes, duration, number } from './dom.js'
+import { h, replace, write, throttle, newId, bytes, duration, fixed, number } from './dom.js'
 import { get, request, jobPath, scanPath, volumePath, listVolumes, watch } from './api.js'
 import { View, planeName, presets, rotationOf } from './view.js'
 import { KeptList } from './kept.js'
@@ -443,7 +443,6 @@ export class JobPage {
 		const text = `${t(volume.name)}${volume.name === 'final' || volume.iteration === 0 ? `, ${volumeText(volume)}` : ''}`
 		this.slider.setAttribute('aria-valuetext', text)
 		write(this.sliderText, text)
-		this.viewer.tag.textContent = volume.name
 		this.viewer.setWhat(this.#whatOf(volume))
 		this.tools.show()
 		this.keyImages.show()
@@ -599,7 +598,7 @@ export class JobPage {
 	/* Place and Hounsfield units under the mouse, else at the cross. */
 	#read() {
 		const at = this.#pointed ?? this.#view.position, value = this.viewer.value(at)
-		const place = at.map((mm, i) => `${'xyz'[i]} ${mm.toFixed(1).replace('-', '−')}`).join('  ')
+		const place = at.map((mm, i) => `${'xyz'[i]} ${fixed(mm)}`).join('  ')
 		write(this.readout, `${place} mm${value === null ? '' : `   ${String(value).replace('-', '−')} HU`}`)
 	}
 

@@ -3,7 +3,7 @@
  * PNG with the measurements that lie in the plane, the letters of its sides and a caption: what volume of which job, by
  * which recipe, when, in which window. Names are in it only where that is asked for.
  */
-import { h, replace, write } from './dom.js'
+import { fullTime, h, replace, write } from './dom.js'
 import { volumePath } from './api.js'
 import { openDialog } from './form.js'
 import { cross, dot, minus, times, unit } from './vector.js'
@@ -110,7 +110,7 @@ export class KeyImages {
 		const { job, name, what, volume } = this.facts()
 		const recipe = item.volume === volume ? what : item.volume
 		return [item.caption, `${this.named.checked && name ? `${name} · ` : ''}${t('job {id}', { id: job })} · ${recipe}`,
-			[item.created && new Date(item.created).toLocaleString(), `W ${item.window} L ${item.level}`, item.thickness > 0 && `${item.thickness} mm ${item.mode ?? 'mean'}`].filter(Boolean).join(' · ')].filter(Boolean)
+			[item.created && fullTime(item.created), `W ${item.window} L ${item.level}`, item.thickness > 0 && `${item.thickness} mm ${item.mode ?? 'mean'}`].filter(Boolean).join(' · ')].filter(Boolean)
 	}
 
 	async #draw(item) {

@@ -5,6 +5,7 @@
  * ruler: [from, to]; angle: [end, vertex, end]; ellipse: [middle, end of one half axis, end of the other];
  * freehand: its corners.
  */
+import { fixed } from './dom.js'
 import { add, cross, dot, flat, minus, norm, times, unit } from './vector.js'
 import { isWithin, sampleAt } from './sample.js'
 
@@ -99,17 +100,15 @@ export function statisticsOf(item, grid) {
 	return values.length > 0 ? { area: region.area, count: values.length, mean, deviation } : { area: region.area, count: 0 }
 }
 
-const minusSign = text => text.replace('-', '−')
-
 /* In words; grid: of the volume that is looked at, where its voxels are here. */
 export function resultOf(item, grid) {
 	if (item.kind === 'ruler')
-		return `${lengthOf(item.points).toFixed(1)} mm`
+		return `${fixed(lengthOf(item.points))} mm`
 	if (item.kind === 'angle')
-		return `${angleOf(item.points).toFixed(1)}°`
+		return `${fixed(angleOf(item.points))}°`
 	const found = statisticsOf(item, grid)
 	if (found === null)
 		return ''
-	const values = found.count > 0 ? `${minusSign(found.mean.toFixed(1))} ± ${found.deviation.toFixed(1)} HU, ` : ''
-	return `${values}${found.area < 100 ? found.area.toFixed(1) : Math.round(found.area)} mm²`
+	const values = found.count > 0 ? `${fixed(found.mean)} ± ${fixed(found.deviation)} HU, ` : ''
+	return `${values}${fixed(found.area, found.area < 100 ? 1 : 0)} mm²`
 }

@@ -4,7 +4,7 @@
  * pixels in the same place: a pixel for each voxel, stretched by the browser.
  * Turned planes and slabs are sampled, as finely as voxels and the screen are.
  */
-import { h, write, inFrame } from './dom.js'
+import { fixed, h, write, inFrame } from './dom.js'
 import { volumePath } from './api.js'
 import { planes, axes, lettersInWords, lettersTowards, planeEdges, planeName } from './view.js'
 import { layersOf, samplerOf } from './sample.js'
@@ -179,7 +179,7 @@ export class Plane {
 		const view = this.#view, { across } = planes[this.name], { thickness, mode } = view.slab
 		const { count, index, mm } = view.depth(this.name)
 		const slab = thickness > 0 ? t(', {mode} of {mm} mm', { mode: { mean: t('mean'), max: 'MIP', min: t('minimum') }[mode], mm: thickness }) : ''
-		const place = `${mm.toFixed(1).replace('-', '−')} mm`
+		const place = `${fixed(mm)} mm`
 		const text = this.#isStraight() ? `${t('{n} of {all}', { n: index + 1, all: count })}, ${axes[across]} ${place}${slab}` : `${t('{place} from the middle', { place })}${slab}`
 		this.slider.max = String(count - 1)
 		this.slider.value = String(index)

@@ -107,7 +107,7 @@ export class Plot {
 		this.picture.setAttribute('aria-label', t('Convergence over {n} iterations: ', { n: this.#rows.length }) +
 			series.map(one => `${t(one.name).toLowerCase()} ${number(last[one.key])}`).join(', '))
 		this.cursor = svg('line', { class: 'cursor', y1: top - 6, y2: series.length * panel })
-		replace(this.picture, series.map((one, i) => this.#panel(one, i * panel)), this.#iterations(series.length * panel), this.cursor)
+		replace(this.picture, this.cursor, series.map((one, i) => this.#panel(one, i * panel)), this.#iterations(series.length * panel))
 		this.#setCursor(this.#selected)
 	}
 

@@ -23,9 +23,8 @@ export class Viewer {
 			this.#onPlane()
 		} }))
 		this.spatial = new Spatial(view)
-		this.tag = h('span', { class: 'tag' })
 		this.element = h('div', { class: 'viewer', role: 'group', 'aria-label': label, 'data-tile': view.tile, 'data-main': view.main },
-			[...this.planes, this.spatial].map(part => part.element), this.tag)
+			[...this.planes, this.spatial].map(part => part.element))
 		this.follow = ({ detail }) => this.#update(detail)
 		view.addEventListener('change', this.follow)
 	}
