@@ -8,16 +8,16 @@ The clocks of the daemons are not compressed: each real second of theirs (a look
 usage: fleet_day.py BUILD FOLDER DATABASE-ADDRESS [--carts N] [--servers N] [--hours H] [--compression C] [--seed N]
 """
 import argparse
-import http.client
 import json
-import os
 import pathlib
 import random
-import socket
 import subprocess
 import sys
 import threading
 import time
+
+sys.path.insert(0, str(pathlib.Path(__file__).resolve().parent.parent / "http"))
+from fleet_host import Host, wait_for
 
 HERE = pathlib.Path(__file__).resolve().parent
 # Seconds on a server's H200: the kernels of tests/bench/results (2026-11-27-h200-d87abe3.txt, any geometry) and 1 s a gigabyte for reading
@@ -32,46 +32,16 @@ LINK = 0.11  # gigabytes a second: 1 Gbit/s
 PATIENTS = 12  # a cart in eight hours
 
 
-def free_port():
-    with socket.socket() as one:
-        one.bind(("127.0.0.1", 0))
-        return one.getsockname()[1]
-
-
-class Host:
-    def __init__(self, options, name, server):
-        self.name, self.port = name, free_port()
-        slow = 1.0 if server else CART
-        seconds = {}
-        for job in JOBS.values():
-            way = job["gigabytes"] / LINK if server else 0.0
-            seconds[job["iterations"]] = (job["seconds"] * slow + way) / options.compression
-        environment = dict(os.environ, PACED_WORKER=f"{options.build}/cbct-worker", OMP_NUM_THREADS="1",
-                           PACED_SECONDS=",".join(f"{n}:{s}" for n, s in seconds.items()))
-        arguments = [f"{options.build}/cbctd", "--listen", f"127.0.0.1:{self.port}", "--state-dir", str(options.folder / name), "--backend", "cpu",
-                     "--threads", "1", "--worker", str(HERE / "paced_worker.py"), "--fleet", "day", "--fleet-database", options.database,
-                     "--fleet-host", name, "--http-threads", "2"]
-        if server:
-            arguments += ["--fleet-address", f"http://127.0.0.1:{self.port}"]
-        with open(options.folder / f"{name}.err", "ab") as log:
-            self.process = subprocess.Popen(arguments, stdout=subprocess.DEVNULL, stderr=log, env=environment)
-
-    def ask(self, method, path, body=None, headers=None):
-        connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=60)
-        try:
-            connection.request(method, path, body, headers or {})
-            reply = connection.getresponse()
-            return reply.status, reply.read()
-        except OSError:
-            return 0, b""
-        finally:
-            connection.close()
-
-    def json(self, method, path, document=None):
-        status, body = self.ask(method, path, json.dumps(document), {"Content-Type": "application/json"})
-        if status not in (200, 201, 202):
-            raise RuntimeError(f"{self.name}: {method} {path} was answered with {status}: {body[:300]}")
-        return json.loads(body)
+def host_of(options, name, server):
+    slow = 1.0 if server else CART
+    seconds = {}
+    for job in JOBS.values():
+        way = job["gigabytes"] / LINK if server else 0.0
+        seconds[job["iterations"]] = (job["seconds"] * slow + way) / options.compression
+    host = Host(options, "day", name, server, ["--worker", str(HERE / "paced_worker.py"), "--http-threads", "2"],
+                {"PACED_WORKER": f"{options.build}/cbct-worker", "OMP_NUM_THREADS": "1", "PACED_SECONDS": ",".join(f"{n}:{s}" for n, s in seconds.items())})
+    host.start()
+    return host
 
 
 def patients(options, cart, folder, begin, posted):
@@ -139,10 +109,12 @@ def main():
                     "--rows", "16", "--pixel", "14"], check=True, stdout=subprocess.DEVNULL)
     hosts, posted, code = [], [], 1
     try:
-        hosts = [Host(options, f"server{i + 1}", True) for i in range(options.servers)] + [Host(options, f"cart{i + 1}", False) for i in range(options.carts)]
+        for i in range(options.servers):
+            hosts.append(host_of(options, f"server{i + 1}", True))
+        for i in range(options.carts):
+            hosts.append(host_of(options, f"cart{i + 1}", False))
         for host in hosts:
-            while host.ask("GET", "/readyz")[0] != 200 and host.process.poll() is None:
-                time.sleep(0.1)
+            wait_for(lambda: host.ask("GET", "/readyz")[0] == 200, 60, f"host {host.name} is ready")
         begin = time.monotonic() + 1
         carts = [threading.Thread(target=patients, args=(options, host, scan, begin, posted)) for host in hosts[options.servers:]]
         for thread in carts:

@@ -6,50 +6,21 @@ usage: fleet_numbers.py BUILD FOLDER DATABASE-ADDRESS [--jobs N] [--takeovers N]
 """
 import argparse
 import datetime
-import http.client
 import json
 import pathlib
 import re
-import socket
 import subprocess
 import sys
 import time
 
-
-def free_port():
-    with socket.socket() as one:
-        one.bind(("127.0.0.1", 0))
-        return one.getsockname()[1]
+sys.path.insert(0, str(pathlib.Path(__file__).resolve().parent.parent / "http"))
+from fleet_host import Host
 
 
-class Host:
-    def __init__(self, options, name, takes):
-        self.name, self.port, self.log = name, free_port(), options.folder / f"{name}.err"
-        self.arguments = [f"{options.build}/cbctd", "--listen", f"127.0.0.1:{self.port}", "--state-dir", str(options.folder / name), "--backend", "cpu",
-                          "--threads", "1", "--fleet", "numbers", "--fleet-database", options.database, "--fleet-host", name,
-                          "--fleet-lease", str(options.lease), "--checkpoint-seconds", "1"]
-        self.arguments += ["--fleet-address", f"http://127.0.0.1:{self.port}"] if takes else ["--worker", "/bin/false"]
-        self.start()
-
-    def start(self):
-        with open(self.log, "ab") as log:
-            self.process = subprocess.Popen(self.arguments, stdout=subprocess.DEVNULL, stderr=log)
-        while self.ask("GET", "/livez")[0] != 200:
-            time.sleep(0.05)
-
-    def ask(self, method, path, body=None):
-        connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=60)
-        try:
-            connection.request(method, path, body, {"Content-Type": "application/json"} if isinstance(body, str) else {})
-            reply = connection.getresponse()
-            return reply.status, reply.read()
-        except OSError:
-            return 0, b""
-        finally:
-            connection.close()
-
-    def json(self, method, path, document=None):
-        return json.loads(self.ask(method, path, None if document is None else json.dumps(document))[1])
+def host_of(options, name, takes):
+    host = Host(options, "numbers", name, takes, ["--fleet-lease", str(options.lease), "--checkpoint-seconds", "1"] + ([] if takes else ["--worker", "/bin/false"]))
+    host.start()
+    return host
 
 
 def post(owner, scan, iterations):
@@ -71,8 +42,7 @@ def takeovers(options, owner, takers, scan):
             time.sleep(0.02)
         victim = takers[device(owner, job)]
         time.sleep(1)
-        victim.process.kill()
-        victim.process.wait()
+        victim.kill()
         began = time.monotonic()
         while device(owner, job) in ("", victim.name):
             time.sleep(0.02)
@@ -116,9 +86,10 @@ def main():
                     "--columns", "24", "--rows", "16", "--pixel", "14"], check=True, stdout=subprocess.DEVNULL)
     hosts = []
     try:
-        takers = {name: Host(options, name, True) for name in ("taker1", "taker2", "taker3")}
-        owner = Host(options, "owner", False)
-        hosts = [owner] + list(takers.values())
+        for name in ("taker1", "taker2", "taker3", "owner"):
+            hosts.append(host_of(options, name, name != "owner"))
+        *takers, owner = hosts
+        takers = {taker.name: taker for taker in takers}
         scan = owner.json("POST", "/v1/scans", json.loads((options.folder / "scan" / "scan.json").read_text()))["id"]
         owner.ask("PUT", f"/v1/scans/{scan}/projections", (options.folder / "scan" / "projections.raw").read_bytes())
         posted, seconds, gaps, each = drain(options, owner, takers, scan)
@@ -129,8 +100,7 @@ def main():
             print(f"{len(seconds)} takers killed, lease {options.lease:g} s: the job ran elsewhere after {', '.join(f'{s:.1f}' for s in seconds)} s")
     finally:
         for host in hosts:
-            host.process.kill()
-            host.process.wait()
+            host.kill()
     return 0
 
 

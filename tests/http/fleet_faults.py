@@ -9,71 +9,25 @@ usage: fleet_faults.py BUILD FOLDER DATABASE-ADDRESS DATA-FOLDER START-COMMAND -
 """
 import argparse
 import collections
-import http.client
 import json
 import os
 import pathlib
 import random
 import shlex
 import signal
-import socket
 import subprocess
 import sys
 import time
+
+from fleet_host import Host, wait_for
 
 LEASE = 3.0
 GRID = {"size": [32, 32, 24], "spacing_mm": [5, 5, 5]}
 RECIPES = [{"grid": GRID, "fdk": {}, "sart": {"iterations": n}, "emit": ["fdk"]} for n in (2, 8, 40)]
 
 
-def free_port():
-    with socket.socket() as one:
-        one.bind(("127.0.0.1", 0))
-        return one.getsockname()[1]
-
-
-class Host:
-    def __init__(self, options, name, takes):
-        self.name, self.port, self.options = name, free_port(), options
-        self.folder = options.folder / name
-        self.arguments = [f"{options.build}/cbctd", "--listen", f"127.0.0.1:{self.port}", "--state-dir", str(self.folder), "--backend", "cpu",
-                          "--threads", "1", "--fleet", "soak", "--fleet-database", options.database, "--fleet-host", name, "--fleet-lease", str(LEASE),
-                          "--fleet-keep-scans", "0"]
-        self.arguments += ["--fleet-address", f"http://127.0.0.1:{self.port}"] if takes else ["--worker", str(options.no_device)]
-        self.process = None
-
-    def start(self):
-        with open(self.options.folder / f"{self.name}.err", "ab") as log:
-            self.process = subprocess.Popen(self.arguments, stdout=subprocess.DEVNULL, stderr=log)
-        wait_for(lambda: self.ask("GET", "/livez")[0] == 200, 60, f"host {self.name} answers")
-
-    def kill(self):
-        self.process.kill()
-        self.process.wait()
-
-    def ask(self, method, path, body=None, headers=None):
-        """Status and body; status 0: no answer."""
-        connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=60)
-        try:
-            connection.request(method, path, body, headers or {})
-            reply = connection.getresponse()
-            return reply.status, reply.read()
-        except (OSError, http.client.HTTPException):
-            return 0, b""
-        finally:
-            connection.close()
-
-    def json(self, path):
-        status, body = self.ask("GET", path)
-        return json.loads(body) if status == 200 else None
-
-
-def wait_for(condition, seconds, what):
-    end = time.monotonic() + seconds
-    while not condition():
-        if time.monotonic() > end:
-            sys.exit(f"expected: {what}, within {seconds} s")
-        time.sleep(0.05)
+def host_of(options, name, takes):
+    return Host(options, "soak", name, takes, ["--fleet-lease", str(LEASE), "--fleet-keep-scans", "0"] + ([] if takes else ["--worker", str(options.no_device)]))
 
 
 def stand_still(processes, seconds):
@@ -97,8 +51,8 @@ def children(process):
 class Run:
     def __init__(self, options):
         self.options, self.random = options, random.Random(options.seed)
-        self.owner = Host(options, "owner", False)
-        self.takers = [Host(options, "taker1", True), Host(options, "taker2", True)]
+        self.owner = host_of(options, "owner", False)
+        self.takers = [host_of(options, "taker1", True), host_of(options, "taker2", True)]
         self.posted, self.count = {}, 0  # id: recipe
         self.counts = collections.Counter()
 
@@ -178,14 +132,14 @@ class Run:
 
     # ---- the check ----
     def ended(self):
-        jobs = [self.owner.json(f"/v1/jobs/{job}") for job in self.posted]
+        jobs = [self.owner.json("GET", f"/v1/jobs/{job}") for job in self.posted]
         return all(job is not None and job["state"] in ("succeeded", "failed", "cancelled") for job in jobs)
 
     def check(self, reference):
         wrong = []
         for job, recipe in self.posted.items():
-            document = self.owner.json(f"/v1/jobs/{job}")
-            volumes = {v["name"]: v.get("digest") for v in self.owner.json(f"/v1/jobs/{job}/volumes")["volumes"]}
+            document = self.owner.json("GET", f"/v1/jobs/{job}")
+            volumes = {v["name"]: v.get("digest") for v in self.owner.json("GET", f"/v1/jobs/{job}/volumes")["volumes"]}
             _, events = self.owner.ask("GET", f"/v1/jobs/{job}/events")
             lines = events.decode().split("\n")
             rows = [json.loads(after[6:])["iteration"] for line, after in zip(lines, lines[1:]) if line == "event: progress"]
@@ -200,11 +154,11 @@ class Run:
         return wrong
 
     def left(self):
-        return [(host.name, path) for host in self.takers for path in ("jobs", "scans") if (host.json(f"/v1/{path}") or {path: [1]})[path]]
+        return [(host.name, path) for host in self.takers for path in ("jobs", "scans") if (host.json("GET", f"/v1/{path}") or {path: [1]})[path]]
 
     def references(self, folder):
         """Digests of the volumes of each recipe, by a daemon that is in no fleet."""
-        alone = Host(self.options, "alone", True)
+        alone = host_of(self.options, "alone", True)
         alone.arguments = [a for i, a in enumerate(alone.arguments) if not a.startswith("--fleet") and not alone.arguments[i - 1].startswith("--fleet")]
         alone.start()
         scan, found = self.post_scan(alone, folder), []
@@ -213,9 +167,9 @@ class Run:
             job = json.loads(body)["id"]
 
             def volumes():
-                document = alone.json(f"/v1/jobs/{job}/volumes") or {"volumes": []}
+                document = alone.json("GET", f"/v1/jobs/{job}/volumes") or {"volumes": []}
                 return {v["name"]: v.get("digest") for v in document["volumes"]}
-            wait_for(lambda: (alone.json(f"/v1/jobs/{job}") or {}).get("state") == "succeeded" and None not in volumes().values(), 300, "a job alone")
+            wait_for(lambda: (alone.json("GET", f"/v1/jobs/{job}") or {}).get("state") == "succeeded" and None not in volumes().values(), 300, "a job alone")
             found.append(volumes())
         alone.kill()
         return found
