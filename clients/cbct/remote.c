@@ -74,7 +74,10 @@ int remote_judge(struct remote *remote, int code, struct error *err)
 	/* Removed there, by an operator or because the claim is another host's now. */
 	if (code == ERR_NOT_FOUND)
 		return error_set(err, ERR_BUSY, "it is gone on %.60s: %.200s", remote->options->host, err->text);
-	if (code != ERR_IO && code != ERR_BUSY && code != ERR_NO_SPACE)
+	/* Another host may have it, and this one other jobs. */
+	if (code == ERR_NO_SPACE)
+		return error_set(err, ERR_BUSY, "%.60s has no room: %.200s", remote->options->host, err->text);
+	if (code != ERR_IO && code != ERR_BUSY)
 		return code;
 	if (clock_monotonic() > remote->contact + remote->options->lease)
 		return error_set(err, ERR_BUSY, "%.60s was lost: %.200s", remote->options->host, err->text);

@@ -47,7 +47,7 @@ int remote_obey(struct remote *remote, int timeout_ms, struct error *err);
 
 /*
  * What follows from the code of a request: 0 for done, 1 for another try, else its code, which the job ends with. A
- * daemon that starts anew, or whose disk is full, has a lease's time to come back.
+ * daemon that starts anew has a lease's time to come back; one whose disk is full gives the job back.
  */
 int remote_judge(struct remote *remote, int code, struct error *err);
 /* Requests to the daemon there, until they are judged; the caller frees *ret_document. */

@@ -50,10 +50,14 @@ static struct copy *find_copy(struct fleet *fleet, const char *id)
 	return copy;
 }
 
-/* A job that has ended goes first: by its scan's name it is known as another host's. */
+/*
+ * A job that has not ended needs it; another host's that has goes first: by its scan's name it is known as that. A
+ * user's own over such a scan goes on to stand without it.
+ */
 static bool has_job(struct fleet *fleet, const char *scan)
 {
 	struct job *page[PAGE];
+	struct job_record record;
 	struct job_facts facts;
 	char after[ID_SIZE];
 	bool more = true, found = false;
@@ -65,8 +69,9 @@ static bool has_job(struct fleet *fleet, const char *scan)
 			return true;
 		for (int i = 0; i < count; i++) {
 			job_facts(page[i], &facts);
+			job_record(page[i], &record);
 			memcpy(after, facts.id, sizeof(after));
-			found |= strcmp(facts.scan, scan) == 0;
+			found |= strcmp(facts.scan, scan) == 0 && (!facts.ended || job_is_mirror(&record));
 			job_release(page[i]);
 		}
 	}

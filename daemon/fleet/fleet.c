@@ -95,7 +95,7 @@ static void leave(struct fleet *fleet)
 	bool had;
 
 	for (int i = 0; i < fleet->claim_count && fleet->ledger != NULL; i++)
-		ledger_give_back(fleet->ledger, &fleet->claims[i], &had, &ignored);
+		ledger_give_back(fleet->ledger, &fleet->claims[i], 0, &had, &ignored);
 	fleet->claim_count = 0;
 	fleet_clear_copies(fleet, true);
 	if (fleet->ledger != NULL)

@@ -21,6 +21,13 @@ struct copy {
 	double used; /* monotonic: when this host last had a claim of its owner's */
 };
 
+enum { RETURNED_MOST = 64 };
+struct returned {
+	char job[ID_SIZE];
+	int count; /* times that others have given it back */
+	double at; /* monotonic: the last of them */
+};
+
 struct fleet {
 	struct jobs *jobs; /* constant, as the next four */
 	struct supervise *supervise;
@@ -43,6 +50,8 @@ struct fleet {
 	int place_count;
 	struct fleet_claim claims[CLAIMS_MOST]; /* of this host */
 	int claim_count;
+
+	struct returned returned[RETURNED_MOST];
 
 	double keep_scans; /* s */
 	struct copy copies[COPIES_MOST];

@@ -9,6 +9,9 @@ static const double WORTH = 2;    /* s: a job that begins here sooner is not wor
 static const double ARRIVES = 2;  /* s since its last projection in which a scan counts as one that arrives */
 static const double STALLED = 30; /* s without a projection after which another host need not wait for any */
 
+static const double PAUSE_MOST = 30; /* s that a job is with nobody which has come back many times */
+static const double FORGOTTEN = 120; /* s after which it counts as one that has not */
+
 static bool has_number(const struct place *places, int count, long long number)
 {
 	for (int i = 0; i < count; i++) {
@@ -51,6 +54,37 @@ static void add_offer(struct offer *offers, int *count, const char *job, enum pr
 }
 
 /*
+ * Seconds that a job which comes back again and again stays with nobody, so that its takers have time for others.
+ */
+static double pause_of(struct fleet *fleet, const char *job)
+{
+	const double now = clock_monotonic();
+	struct returned *returned = &fleet->returned[0];
+	double pause = 0.5;
+
+	for (int i = 0; i < RETURNED_MOST; i++) {
+		struct returned *other = &fleet->returned[i];
+
+		if (strcmp(other->job, job) == 0) {
+			returned = other;
+			break;
+		}
+		if (other->at < returned->at)
+			returned = other;
+	}
+	if (strcmp(returned->job, job) != 0 || now > returned->at + FORGOTTEN)
+		returned->count = 0;
+	snprintf(returned->job, sizeof(returned->job), "%s", job);
+	returned->at = now;
+	/* The first time may be chance. */
+	if (returned->count++ == 0)
+		return 0;
+	for (int i = 2; i < returned->count && pause < PAUSE_MOST; i++)
+		pause *= 2;
+	return pause < PAUSE_MOST ? pause : PAUSE_MOST;
+}
+
+/*
  * The claims of others on this owner's jobs become places; those whose place is spent are given back. A lease that
  * ended while nobody could reach the database has not been lost: its taker has a lease's time to renew it.
  */
@@ -73,7 +107,7 @@ static int take_claims(struct fleet *fleet, struct offer *offers, int *offer_cou
 			continue;
 		add_offer(offers, offer_count, claim->job, facts.priority, &facts.where);
 		if (has_number(spent, spent_count, claim->number)) {
-			code = ledger_give_back(fleet->ledger, claim, &had, err);
+			code = ledger_give_back(fleet->ledger, claim, pause_of(fleet, claim->job), &had, err);
 			continue;
 		}
 		if ((claim->lapsed && !patient) || fleet->place_count == PLACES_MAX)

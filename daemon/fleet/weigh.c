@@ -65,12 +65,14 @@ static void weigh_job(struct fleet *fleet, struct job *job, bool clean, struct l
 {
 	const struct fleet_claim *claim;
 	struct job_record record;
+	const char *key;
 	bool waits;
 
 	job_record(job, &record);
-	waits = record.state == JOB_WAITING && !record.attended && !job_is_mirror(&record);
-	if (job_is_mirror(&record)) {
-		claim = claim_of(fleet, record.key);
+	key = job_mirror_key(&record);
+	waits = record.state == JOB_WAITING && !record.attended && key == NULL;
+	if (key != NULL) {
+		claim = claim_of(fleet, key);
 		if (claim != NULL)
 			load->begun[claim - fleet->claims] = true;
 		else if (clean)

@@ -137,6 +137,9 @@ void jobs_statistics(struct jobs *jobs, struct jobs_statistics *ret);
 /* A job with an Idempotency-Key that begins so is another daemon's: it is computed here, and no one else is to. */
 #define JOB_MIRROR_KEY "fleet:"
 bool job_is_mirror(const struct job_record *record);
+/* Its Idempotency-Key as it was sent: one of a client with a name is kept behind that. NULL: it is this daemon's own.
+ */
+const char *job_mirror_key(const struct job_record *record);
 struct job_offer {
 	char id[ID_SIZE], scan[ID_SIZE];
 	enum priority priority;

@@ -5,9 +5,17 @@
 
 #include "daemon/jobs/internal.h"
 
+const char *job_mirror_key(const struct job_record *record)
+{
+	const char *end = record->key == NULL ? NULL : strchr(record->key, '\n');
+	const char *key = end == NULL ? record->key : end + 1;
+
+	return key != NULL && strncmp(key, JOB_MIRROR_KEY, strlen(JOB_MIRROR_KEY)) == 0 ? key : NULL;
+}
+
 bool job_is_mirror(const struct job_record *record)
 {
-	return record->key != NULL && strncmp(record->key, JOB_MIRROR_KEY, strlen(JOB_MIRROR_KEY)) == 0;
+	return job_mirror_key(record) != NULL;
 }
 
 void job_stay(struct job *job)

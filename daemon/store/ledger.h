@@ -106,8 +106,8 @@ int ledger_renew(struct ledger *ledger, struct fleet_claim *ret_claims, int most
 		 struct error *err) LEDGER_WEAK;
 
 /* ---- of both ---- */
-/* The claim of that number ends, and others may claim the offer. *ret_had false: it had ended. */
-int ledger_give_back(struct ledger *ledger, const struct fleet_claim *claim, bool *ret_had,
+/* The claim of that number ends, and after `pause` s others may claim the offer. *ret_had false: it had ended. */
+int ledger_give_back(struct ledger *ledger, const struct fleet_claim *claim, double pause, bool *ret_had,
 		     struct error *err) LEDGER_WEAK;
 /*
  * Sleeps until another host has changed the ledger, `descriptor` can be read, or so many seconds have passed. A change

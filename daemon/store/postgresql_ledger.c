@@ -421,16 +421,19 @@ int ledger_renew(struct ledger *ledger, struct fleet_claim *ret_claims, int most
 	return code;
 }
 
-int ledger_give_back(struct ledger *ledger, const struct fleet_claim *claim, bool *ret_had, struct error *err)
+int ledger_give_back(struct ledger *ledger, const struct fleet_claim *claim, double pause, bool *ret_had,
+		     struct error *err)
 {
-	const struct value values[] = {text_value(claim->owner), text_value(claim->job), integer_value(claim->number)};
+	const struct value values[] = {text_value(claim->owner), text_value(claim->job), integer_value(claim->number),
+				       seconds_value(pause)};
 	int code;
 
 	*ret_had = false;
 	code = session_run(&ledger->session,
-			   "UPDATE offers SET taker = NULL, number = NULL, until = NULL WHERE owner = $1::text"
+			   "UPDATE offers SET taker = NULL, number = NULL,"
+			   " until = now() + $4::float8 * interval '1 second' WHERE owner = $1::text"
 			   " AND job = $2::text AND number = $3::bigint RETURNING job",
-			   values, 3, note_change, ret_had, err);
+			   values, 4, note_change, ret_had, err);
 	return code == 0 && *ret_had ? tell_others(ledger, err) : code;
 }
 

@@ -1,5 +1,5 @@
 # A PostgreSQL server of Debian's for one test, sourced by test_postgresql.sh and tests/postgresql.sh: in a folder of its
-# own, as a user that is not root, on a Unix socket in that folder and on nothing else. The database is thrown away, so
+# own, as a user that is not root, on a Unix socket in that folder, and on $pg_address where that is set. The database is thrown away, so
 # nothing is synced: what a `kill -9` of the server leaves is in the kernel's memory.
 
 # s for one unit test, in place of check's 4: a store that is opened asks the server hundreds of times, and a test opens up
@@ -28,12 +28,13 @@ start_postgresql() {
 	"${as_server[@]}" "$programs/initdb" -D "$pg_folder/server/data" -U cbctd -A trust -E UTF8 --locale C.UTF-8 --no-sync >"$pg_folder/log" 2>&1 ||
 		{ cat "$pg_folder/log" >&2; return 1; }
 	cat >>"$pg_folder/server/data/postgresql.conf" <<-END
-		listen_addresses = ''
+		listen_addresses = '${pg_address:-}'
 		unix_socket_directories = '$pg_folder/server'
 		fsync = off
 		max_connections = 60
 		shared_buffers = 16MB
 	END
+	[ -z "${pg_address:-}" ] || echo "host all all samenet trust" >>"$pg_folder/server/data/pg_hba.conf"
 	database="postgresql://cbctd@/postgres?host=$pg_folder/server"
 	start_server
 }

@@ -108,12 +108,12 @@ static int claimed(struct ledger *ledger, struct fleet_claim *ret_claims)
 	return count;
 }
 
-static bool give_back(struct ledger *ledger, const struct fleet_claim *claim)
+static bool give_back(struct ledger *ledger, const struct fleet_claim *claim, double pause)
 {
 	struct error err = {0};
 	bool had;
 
-	ck_assert_msg(ledger_give_back(ledger, claim, &had, &err) == 0, "%s", err.text);
+	ck_assert_msg(ledger_give_back(ledger, claim, pause, &had, &err) == 0, "%s", err.text);
 	return had;
 }
 
@@ -212,7 +212,7 @@ START_TEST(nobody_claims_its_own_or_what_is_below_the_least)
 	ck_assert_str_eq(claim(hosts[1], 1, &one), "a0");
 	/* An offer that goes takes its claim with it. */
 	offer(hosts[0], NULL, 0);
-	ck_assert(!give_back(hosts[1], &one));
+	ck_assert(!give_back(hosts[1], &one, 0));
 	disband();
 }
 END_TEST
@@ -239,7 +239,7 @@ START_TEST(an_old_number_changes_nothing)
 	ck_assert_int_gt(new.number, old.number);
 	/* What the first taker does after its sleep. */
 	ck_assert_int_eq(renew(hosts[1], claims), 0);
-	ck_assert(!give_back(hosts[1], &old));
+	ck_assert(!give_back(hosts[1], &old, 0));
 	ck_assert_int_eq(claimed(hosts[0], claims), 1);
 	ck_assert_int_eq(claims[0].number, new.number);
 	ck_assert_str_eq(claims[0].taker, "c");
@@ -250,10 +250,18 @@ START_TEST(an_old_number_changes_nothing)
 	ck_assert_int_eq(claimed(hosts[0], claims), 1);
 	ck_assert(!claims[0].lapsed);
 	/* Given back, it has a new number with the next. */
-	ck_assert(give_back(hosts[2], &new));
+	ck_assert(give_back(hosts[2], &new, 0));
 	seen(hosts[0]);
 	ck_assert_str_eq(claim(hosts[1], 0, &old), "a0");
 	ck_assert_int_gt(old.number, new.number);
+	/* Nobody has it for a while that its owner says. */
+	ck_assert(give_back(hosts[0], &old, LEASE / 2));
+	seen(hosts[0]);
+	ck_assert_str_eq(claim(hosts[2], 0, &new), "");
+	ck_assert_int_eq(claimed(hosts[0], claims), 0);
+	sleep_for(LEASE / 2 + 0.1);
+	seen(hosts[0]);
+	ck_assert_str_eq(claim(hosts[2], 0, &new), "a0");
 	disband();
 }
 END_TEST
