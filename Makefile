@@ -266,7 +266,7 @@ apt_install = { $$run apt-get install -y -qq --no-install-recommends $(1) >/dev/
 	  { $$run apt-get update -qq && DEBIAN_FRONTEND=noninteractive $$run apt-get install -y -qq --no-install-recommends $(1) >/dev/null; }; }
 
 check: OPTIONAL += pg_config:libpq-dev pg_ctlcluster:postgresql
-check: OPTIONAL += g++:g++ /usr/include/dcmtk/dcmnet/scu.h:libdcmtk-dev chromium:chromium dciodvfy:dicom3tools Orthanc:orthanc-dicomweb /usr/share/orthanc/plugins/libOrthancWebViewer.so:orthanc-webviewer promtool:prometheus systemd-analyze:systemd
+check: OPTIONAL += ip:iproute2 g++:g++ /usr/include/dcmtk/dcmnet/scu.h:libdcmtk-dev chromium:chromium dciodvfy:dicom3tools Orthanc:orthanc-dicomweb /usr/share/orthanc/plugins/libOrthancWebViewer.so:orthanc-webviewer promtool:prometheus systemd-analyze:systemd
 check: MODULES += matplotlib:python3-matplotlib nibabel:python3-nibabel pydicom:python3-pydicom gdcm:python3-gdcm h5py:python3-h5py olefile:python3-olefile odil:python3-odil
 setup: ## install the Debian packages that are missing
 	@missing=""; \
