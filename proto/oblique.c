@@ -153,31 +153,6 @@ static inline int smaller(int a, int b)
 	return a < b ? a : b;
 }
 
-/* The volume at a point, in voxels, between the eight nearest; what is not a number stays one. */
-static inline float sample(const struct cell *cell, float x, float y, float z)
-{
-	const float *at;
-	float low, high;
-	int i, j, k;
-
-	x = clamped(x, cell->most[0]);
-	y = clamped(y, cell->most[1]);
-	z = clamped(z, cell->most[2]);
-	i = smaller((int)x, cell->last[0]);
-	j = smaller((int)y, cell->last[1]);
-	k = smaller((int)z, cell->last[2]);
-	x -= (float)i;
-	y -= (float)j;
-	z -= (float)k;
-	at = cell->voxels + (size_t)k * cell->plane + (size_t)j * cell->row + (size_t)i;
-#define ROW(p) ((p)[0] + x * ((p)[cell->along_x] - (p)[0]))
-	low = ROW(at) + y * (ROW(at + cell->along_y) - ROW(at));
-	at += cell->along_z;
-	high = ROW(at) + y * (ROW(at + cell->along_y) - ROW(at));
-#undef ROW
-	return low + z * (high - low);
-}
-
 static struct cell cell_of(const float *voxels, const struct grid *grid)
 {
 	size_t nx = (size_t)grid->size[0], ny = (size_t)grid->size[1];
@@ -193,16 +168,61 @@ static struct cell cell_of(const float *voxels, const struct grid *grid)
 	return cell;
 }
 
-/* Adds one layer of a row's tile to the values so far; counts the samples of each pixel. */
-static void add_layer(const struct cell *cell, const struct grid *grid, const struct line *line, int count,
-		      enum slab_mode mode, float *values, int *counts)
+/* Of one layer of a tile's row the samples within the volume: the least of the eight voxels about each, and how far
+ * from it. */
+struct places {
+	int first, end;                  /* columns; none where first >= end */
+	size_t at[TILE];                 /* in the volume */
+	float x[TILE], y[TILE], z[TILE]; /* 0 to 1 */
+};
+
+/* Fetches the voxels, too, which are used a line later: by then they are in the cache. */
+static void locate(const struct cell *cell, const struct grid *grid, const struct line *line, int count,
+		   struct places *ret)
 {
-	int end, first = columns_within(line, grid, count, &end);
 	const float x0 = (float)line->start[0], y0 = (float)line->start[1], z0 = (float)line->start[2];
 	const float dx = (float)line->step[0], dy = (float)line->step[1], dz = (float)line->step[2];
 
-	for (int i = first; i < end; i++) {
-		float value = sample(cell, x0 + (float)i * dx, y0 + (float)i * dy, z0 + (float)i * dz);
+	ret->first = columns_within(line, grid, count, &ret->end);
+	for (int c = ret->first; c < ret->end; c++) {
+		float x = clamped(x0 + (float)c * dx, cell->most[0]);
+		float y = clamped(y0 + (float)c * dy, cell->most[1]);
+		float z = clamped(z0 + (float)c * dz, cell->most[2]);
+		int i = smaller((int)x, cell->last[0]), j = smaller((int)y, cell->last[1]),
+		    k = smaller((int)z, cell->last[2]);
+		const float *at = cell->voxels + (size_t)k * cell->plane + (size_t)j * cell->row + (size_t)i;
+
+		ret->at[c] = (size_t)(at - cell->voxels);
+		ret->x[c] = x - (float)i;
+		ret->y[c] = y - (float)j;
+		ret->z[c] = z - (float)k;
+		__builtin_prefetch(at);
+		__builtin_prefetch(at + cell->along_y);
+		__builtin_prefetch(at + cell->along_z);
+		__builtin_prefetch(at + cell->along_z + cell->along_y);
+	}
+}
+
+/* The volume there, between the eight voxels; what is not a number stays one. */
+static inline float sample(const struct cell *cell, const struct places *places, int c)
+{
+	const float *at = cell->voxels + places->at[c], x = places->x[c], y = places->y[c];
+	float low, high;
+
+#define ROW(p) ((p)[0] + x * ((p)[cell->along_x] - (p)[0]))
+	low = ROW(at) + y * (ROW(at + cell->along_y) - ROW(at));
+	at += cell->along_z;
+	high = ROW(at) + y * (ROW(at + cell->along_y) - ROW(at));
+#undef ROW
+	return low + places->z[c] * (high - low);
+}
+
+/* Adds a layer to the values so far; counts the samples of each pixel. */
+static void add_layer(const struct cell *cell, const struct places *places, enum slab_mode mode, float *values,
+		      int *counts)
+{
+	for (int i = places->first; i < places->end; i++) {
+		float value = sample(cell, places, i);
 
 		if (counts[i]++ == 0)
 			values[i] = value;
@@ -222,44 +242,69 @@ static unsigned char gray(float value, float black, float scale)
 	return (unsigned char)(int)(level + 0.5f);
 }
 
+/* The samples of a layer of a row, from column `left` on. */
+static struct line line_of(const struct oblique *oblique, const struct grid *grid, const double normal[3], int left,
+			   int row, int layer, int layers)
+{
+	double across = (left - (oblique->size[0] - 1) / 2.0) * oblique->pixel_mm[0];
+	double along = (row - (oblique->size[1] - 1) / 2.0) * oblique->pixel_mm[1];
+	double depth = ((layer + 0.5) / layers - 0.5) * oblique->thickness;
+	struct line line;
+
+	for (int i = 0; i < 3; i++) {
+		line.start[i] = (oblique->center[i] + across * oblique->right[i] + along * oblique->down[i] +
+				 depth * normal[i] - grid->origin[i]) /
+				grid->spacing[i];
+		line.step[i] = oblique->right[i] * oblique->pixel_mm[0] / grid->spacing[i];
+	}
+	return line;
+}
+
+static void put_row(const float *values, const int *counts, int count, const struct oblique *oblique,
+		    unsigned char *ret)
+{
+	const float black = (float)oblique->black, scale = (float)(255 / (oblique->white - oblique->black));
+
+	for (int i = 0; i < count; i++) {
+		float value = oblique->mode == SLAB_MEAN && counts[i] > 1 ? values[i] / (float)counts[i] : values[i];
+
+		ret[i] = counts[i] > 0 ? gray(value, black, scale) : 0;
+	}
+}
+
 void oblique_make(const float *voxels, const struct grid *grid, const struct oblique *oblique,
 		  unsigned char *ret_pixels)
 {
 	const struct cell cell = cell_of(voxels, grid);
-	const float black = (float)oblique->black, scale = (float)(255 / (oblique->white - oblique->black));
-	const int layers = oblique_layers(oblique, grid), width = oblique->size[0];
+	const int layers = oblique_layers(oblique, grid), width = oblique->size[0], lines = oblique->size[1] * layers;
+	struct places places[2]; /* of this line and the next */
+	float values[TILE];
+	int counts[TILE];
 	double normal[3];
 
 	normal_of(oblique, normal);
 	for (int left = 0; left < width; left += TILE) {
 		int count = smaller(TILE, width - left);
 
-		for (int row = 0; row < oblique->size[1]; row++) {
-			unsigned char *to = ret_pixels + (size_t)row * (size_t)width + (size_t)left;
-			float values[TILE] = {0};
-			int counts[TILE] = {0};
+		for (int n = -1; n < lines; n++) {
+			int row = n / layers, layer = n % layers;
 
-			for (int layer = 0; layer < layers; layer++) {
-				double across = (left - (width - 1) / 2.0) * oblique->pixel_mm[0];
-				double along = (row - (oblique->size[1] - 1) / 2.0) * oblique->pixel_mm[1];
-				double depth = ((layer + 0.5) / layers - 0.5) * oblique->thickness;
-				struct line line;
+			if (n + 1 < lines) {
+				struct line line =
+				    line_of(oblique, grid, normal, left, (n + 1) / layers, (n + 1) % layers, layers);
 
-				for (int i = 0; i < 3; i++) {
-					line.start[i] =
-					    (oblique->center[i] + across * oblique->right[i] +
-					     along * oblique->down[i] + depth * normal[i] - grid->origin[i]) /
-					    grid->spacing[i];
-					line.step[i] = oblique->right[i] * oblique->pixel_mm[0] / grid->spacing[i];
-				}
-				add_layer(&cell, grid, &line, count, oblique->mode, values, counts);
+				locate(&cell, grid, &line, count, &places[(n + 1) % 2]);
 			}
-			for (int i = 0; i < count; i++) {
-				float value = oblique->mode == SLAB_MEAN && counts[i] > 1 ? values[i] / (float)counts[i]
-											  : values[i];
-
-				to[i] = counts[i] > 0 ? gray(value, black, scale) : 0;
+			if (n < 0)
+				continue;
+			if (layer == 0) {
+				memset(values, 0, sizeof(values));
+				memset(counts, 0, sizeof(counts));
 			}
+			add_layer(&cell, &places[n % 2], oblique->mode, values, counts);
+			if (layer == layers - 1)
+				put_row(values, counts, count, oblique,
+					ret_pixels + (size_t)row * (size_t)width + (size_t)left);
 		}
 	}
 }
