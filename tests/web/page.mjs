@@ -1022,7 +1022,8 @@ test('the interface is a page to read, and has every operation of the schema', a
 for (const sizes of [[[1366, 768], [1024, 768]], [[844, 390]]]) {
 	const [[first, second]] = sizes, touch = Math.min(first, second) < 500
 	test(`${sizes.map(size => size.join(' x ')).join(', ')}: room for the picture, targets for fingers, nothing beside the screen, in both themes`, async () => {
-		const page = await openFinished({ viewport: { width: first, height: second }, isMobile: touch, hasTouch: touch, colorScheme: 'dark' })
+		/* German words are the longer ones. */
+		const page = await openFinished({ viewport: { width: first, height: second }, isMobile: touch, hasTouch: touch, colorScheme: 'dark', locale: touch ? 'de-DE' : 'en-US' })
 		await page.waitForSelector(`${tile('3d')}[data-shown=final]`)
 		for (const [width, height] of sizes) {
 			await page.setViewportSize({ width, height })

@@ -41,8 +41,8 @@ function between(low, high) {
 }
 
 const tickText = ({ factor, exponent }) => exponent >= -3 && exponent <= 3
-	? String(Number((factor * 10 ** exponent).toPrecision(3)))
-	: `${factor === 1 ? '' : `${factor}·`}10${superscript(exponent)}`
+	? number(Number((factor * 10 ** exponent).toPrecision(3)))
+	: `${factor === 1 ? '' : `${number(factor)}·`}10${superscript(exponent)}`
 
 /* Whole iterations at a readable distance. */
 function steps(first, last) {
