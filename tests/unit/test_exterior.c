@@ -35,6 +35,13 @@ static struct ellipsoid tapered_parts[] = {
     {SHAPE_ELLIPSOID, {8, 8, 8}, {50, -10, 78}, 0, .015},
 };
 static const struct phantom tapered = {5, tapered_parts};
+/* A pelvis: wide bones that cross the ends of the grids, and soft tissue and bowel between them. */
+static struct ellipsoid pelvis_parts[] = {
+    {SHAPE_CYLINDER, {105, 75, 250}, {0, 0, 0}, 0, .0192},    {SHAPE_CYLINDER, {18, 16, 250}, {0, -45, 0}, 0, .0115},
+    {SHAPE_ELLIPSOID, {14, 45, 45}, {70, 0, 70}, .5, .0192},  {SHAPE_ELLIPSOID, {14, 45, 45}, {-70, 0, 70}, -.5, .0192},
+    {SHAPE_ELLIPSOID, {60, 14, 40}, {0, -40, -70}, 0, .0192}, {SHAPE_ELLIPSOID, {30, 25, 60}, {0, 25, 60}, 0, -.012},
+};
+static const struct phantom pelvis = {6, pelvis_parts};
 
 enum orbit_kind { CIRCLE, SHORT_SCAN, SWEEP };
 
@@ -72,6 +79,7 @@ static struct grid grid_between(double low, double high, double spacing)
 /* Errors of slice means in HU over the body, the worst of all slices and of those that all views see. */
 struct worst {
 	double any, seen, root; /* root: root mean square over all slices */
+	double apart;           /* of two slices' means */
 };
 
 static bool is_seen(const double (*matrices)[12], const struct geometry *geometry, const double place[3])
@@ -90,6 +98,7 @@ static struct worst slice_errors(const struct geometry *geometry, const struct g
 				 const float *truth)
 {
 	double(*matrices)[12] = malloc(sizeof(*matrices) * (size_t)geometry->count);
+	double least = INFINITY, most = -INFINITY;
 	struct worst worst = {0};
 	size_t at = 0, all = 0;
 
@@ -118,11 +127,14 @@ static struct worst slice_errors(const struct geometry *geometry, const struct g
 		all += count;
 		if (count == 0)
 			continue;
+		least = fmin(least, sum / (double)count);
+		most = fmax(most, sum / (double)count);
 		worst.any = fmax(worst.any, fabs(sum / (double)count));
 		if (seen)
 			worst.seen = fmax(worst.seen, fabs(sum / (double)count));
 	}
 	worst.root = sqrt(worst.root / (double)all);
+	worst.apart = most - least;
 	free(matrices);
 	return worst;
 }
@@ -147,25 +159,27 @@ static const struct {
 	int subsets;
 	enum projector projector;
 	bool no_fdk, no_extension;
+	const struct algorithm *algorithm; /* NULL: SART */
 } ends[] = {
-    {"+-60", CIRCLE, &trunk, 60, 60, 5, SUBSETS_DEFAULT, PROJECTOR_INTERPOLATING, 0, 0},
-    {"+-65", CIRCLE, &trunk, 65, 65, 5, SUBSETS_DEFAULT, PROJECTOR_MATCHED, 0, 0},
-    {"+-68", CIRCLE, &trunk, 68, 68, 4, SUBSETS_DEFAULT, PROJECTOR_INTERPOLATING, 0, 0},
-    {"+-72", CIRCLE, &trunk, 72, 72, 4, SUBSETS_DEFAULT, PROJECTOR_INTERPOLATING, 0, 1},
-    {"+-75, one subset", CIRCLE, &trunk, 75, 75, 5, 1, PROJECTOR_INTERPOLATING, 0, 0},
-    {"+-75, by view", CIRCLE, &trunk, 75, 75, 5, SUBSETS_VIEWS, PROJECTOR_MATCHED, 0, 0},
-    {"+-76", CIRCLE, &trunk, 76, 76, 4, SUBSETS_DEFAULT, PROJECTOR_INTERPOLATING, 0, 0},
-    {"-20 to 80", CIRCLE, &trunk, 20, 80, 5, SUBSETS_DEFAULT, PROJECTOR_INTERPOLATING, 0, 0},
-    {"+-85", CIRCLE, &trunk, 85, 85, 5, SUBSETS_DEFAULT, PROJECTOR_INTERPOLATING, 0, 0},
-    {"tapered, +-65", CIRCLE, &tapered, 65, 65, 5, SUBSETS_DEFAULT, PROJECTOR_INTERPOLATING, 0, 0},
-    {"tapered, -75 to 70", CIRCLE, &tapered, 75, 70, 5, SUBSETS_DEFAULT, PROJECTOR_MATCHED, 0, 0},
-    {"short scan, +-70", SHORT_SCAN, &trunk, 70, 70, 5, SUBSETS_DEFAULT, PROJECTOR_INTERPOLATING, 0, 0},
-    {"short scan, +-80", SHORT_SCAN, &tapered, 80, 80, 5, SUBSETS_DEFAULT, PROJECTOR_INTERPOLATING, 0, 0},
-    {"sweep, +-70", SWEEP, &trunk, 70, 70, 5, SUBSETS_DEFAULT, PROJECTOR_INTERPOLATING, 0, 0},
-    {"sweep, +-80", SWEEP, &trunk, 80, 80, 5, SUBSETS_DEFAULT, PROJECTOR_MATCHED, 0, 0},
-    {"sweep, +-90", SWEEP, &tapered, 90, 90, 5, SUBSETS_DEFAULT, PROJECTOR_INTERPOLATING, 0, 0},
-    {"SART alone, +-60", CIRCLE, &trunk, 60, 60, 5, SUBSETS_DEFAULT, PROJECTOR_INTERPOLATING, 1, 0},
-    {"SART alone, +-70", CIRCLE, &trunk, 70, 70, 5, SUBSETS_DEFAULT, PROJECTOR_INTERPOLATING, 1, 1},
+    {"+-60", CIRCLE, &trunk, 60, 60, 5, SUBSETS_DEFAULT, PROJECTOR_INTERPOLATING, 0, 0, NULL},
+    {"+-65", CIRCLE, &trunk, 65, 65, 5, SUBSETS_DEFAULT, PROJECTOR_MATCHED, 0, 0, NULL},
+    {"+-68", CIRCLE, &trunk, 68, 68, 4, SUBSETS_DEFAULT, PROJECTOR_INTERPOLATING, 0, 0, NULL},
+    {"+-72", CIRCLE, &trunk, 72, 72, 4, SUBSETS_DEFAULT, PROJECTOR_INTERPOLATING, 0, 1, NULL},
+    {"+-75, one subset", CIRCLE, &trunk, 75, 75, 5, 1, PROJECTOR_INTERPOLATING, 0, 0, NULL},
+    {"+-75, by view", CIRCLE, &trunk, 75, 75, 5, SUBSETS_VIEWS, PROJECTOR_MATCHED, 0, 0, NULL},
+    {"+-76, CGLS", CIRCLE, &trunk, 76, 76, 4, SUBSETS_DEFAULT, PROJECTOR_MATCHED, 0, 0, &algorithm_cgls},
+    {"+-75, FISTA", CIRCLE, &trunk, 75, 75, 5, SUBSETS_DEFAULT, PROJECTOR_MATCHED, 0, 0, &algorithm_fista},
+    {"-20 to 80", CIRCLE, &trunk, 20, 80, 5, SUBSETS_DEFAULT, PROJECTOR_INTERPOLATING, 0, 0, NULL},
+    {"+-85", CIRCLE, &trunk, 85, 85, 5, SUBSETS_DEFAULT, PROJECTOR_INTERPOLATING, 0, 0, NULL},
+    {"wide bone, +-85", CIRCLE, &pelvis, 85, 85, 5, SUBSETS_DEFAULT, PROJECTOR_INTERPOLATING, 0, 0, NULL},
+    {"tapered, -75 to 70", CIRCLE, &tapered, 75, 70, 5, SUBSETS_DEFAULT, PROJECTOR_MATCHED, 0, 0, NULL},
+    {"short scan, +-70", SHORT_SCAN, &trunk, 70, 70, 5, SUBSETS_DEFAULT, PROJECTOR_INTERPOLATING, 0, 0, NULL},
+    {"short scan, +-80", SHORT_SCAN, &tapered, 80, 80, 5, SUBSETS_DEFAULT, PROJECTOR_INTERPOLATING, 0, 0, NULL},
+    {"sweep, +-70", SWEEP, &trunk, 70, 70, 5, SUBSETS_DEFAULT, PROJECTOR_INTERPOLATING, 0, 0, NULL},
+    {"sweep, +-80", SWEEP, &trunk, 80, 80, 5, SUBSETS_DEFAULT, PROJECTOR_MATCHED, 0, 0, NULL},
+    {"sweep, +-90", SWEEP, &tapered, 90, 90, 5, SUBSETS_DEFAULT, PROJECTOR_INTERPOLATING, 0, 0, NULL},
+    {"SART alone, +-60", CIRCLE, &trunk, 60, 60, 5, SUBSETS_DEFAULT, PROJECTOR_INTERPOLATING, 1, 0, NULL},
+    {"SART alone, +-70", CIRCLE, &trunk, 70, 70, 5, SUBSETS_DEFAULT, PROJECTOR_INTERPOLATING, 1, 1, NULL},
 };
 
 /*
@@ -184,6 +198,10 @@ START_TEST(the_end_slices_of_a_trunk_longer_than_the_panel_are_true)
 	ck_assert_ptr_nonnull(truth);
 	if (scan_of(&scene, ends[_i].kind, ends[_i].phantom)) {
 		phantom_voxelise(ends[_i].phantom, &grid, 3, truth);
+		if (ends[_i].algorithm != NULL)
+			recipe_set_algorithm(&recipe, ends[_i].algorithm);
+		if (ends[_i].algorithm == &algorithm_fista)
+			recipe.iterate.iterations = 6;
 		recipe.sart.subsets = ends[_i].subsets;
 		recipe.projector = ends[_i].projector;
 		recipe.fdk.on = !ends[_i].no_fdk;
@@ -221,8 +239,11 @@ START_TEST(a_poor_orbit_does_not_pile_the_trunk_up)
 	recipe.fdk.on = _i == 0;
 	run(&scene, &recipe, &outcome);
 	worst = slice_errors(&scene.geometry, &grid, outcome.last, truth);
-	/* In the middle slices the arc alone is worth 90 HU; more than 1000 at the ends where nothing is taken out. */
-	ck_assert_msg(worst.any < 130, "%.1f HU", worst.any);
+	/*
+	 * The arc alone, 120 degrees, takes 50 HU from the middle slices (tests/bench/results/exterior.txt); more than
+	 * 1000 at the ends where nothing is taken out.
+	 */
+	ck_assert_msg(worst.any < 90 && worst.apart < 70, "%.1f HU, %.1f HU apart", worst.any, worst.apart);
 	ck_assert_ptr_nonnull(strstr(outcome.warnings, "outside_grid: "));
 	outcome_clear(&outcome);
 	scene_clear(&scene);
@@ -276,7 +297,7 @@ START_TEST(a_real_abdomen_keeps_its_end_slices)
 	}
 	run(&scene, &recipe, &outcome);
 	worst = slice_errors(&scene.geometry, &grid, outcome.last, truth);
-	ck_assert_msg(worst.seen < 30 && worst.any < 40, "%.1f HU where all views see it, else %.1f HU", worst.seen,
+	ck_assert_msg(worst.seen < 20 && worst.any < 40, "%.1f HU where all views see it, else %.1f HU", worst.seen,
 		      worst.any);
 	outcome_clear(&outcome);
 	scene_clear(&scene);
@@ -421,7 +442,8 @@ START_TEST(a_tube_that_gives_less_is_not_taken_for_a_body_that_is_cut_off)
 		scene.projections[i] -= logf(0.92f);
 	run(&scene, &recipe, &outcome);
 	worst = slice_errors(&scene.geometry, &grid, outcome.last, truth);
-	ck_assert_msg(worst.any < 100, "%.1f HU", worst.any);
+	/* Its skull ends 2 mm beyond the grid: 39 HU without the tube's 8 %, which are worth 15 everywhere. */
+	ck_assert_msg(worst.any < 60, "%.1f HU", worst.any);
 	ck_assert_ptr_nonnull(strstr(outcome.warnings, "air_level: "));
 	ck_assert_ptr_null(strstr(outcome.warnings, "truncated: "));
 	outcome_clear(&outcome);
