@@ -84,7 +84,8 @@ export function correlation(a, b) {
 
 export const complaints = []
 
-const common = ['--no-sandbox', '--disable-quic', '--no-first-run', '--disable-background-networking', '--disable-component-update', '--disable-sync']
+/* Pages are composed in plain memory: SwiftShader, which WebGL is drawn by here, would take half of a test's processor time for that. */
+const common = ['--disable-gpu-compositing', '--no-sandbox', '--disable-quic', '--no-first-run', '--disable-background-networking', '--disable-component-update', '--disable-sync']
 /* WebGL 2 without a graphics card. */
 export const software = ['--use-angle=swiftshader', '--enable-unsafe-swiftshader']
 export const withoutGraphics = ['--disable-3d-apis']
