@@ -14,7 +14,7 @@ import { Gestures } from './gestures.js'
 import { t } from './lang.js'
 
 const narrowMost = 280, tinyMost = 170 /* px: below, there is no room for words beside the letters, nor for letters beside the plane's name */
-const quickMost = 1.5e6 /* samples that are taken at once; a finer picture follows, piece by piece */
+const quickMost = 4.5e6 /* samples that the planes in sight take at once; a finer picture follows, piece by piece */
 const restTime = 120 /* ms after which it does */
 const pieceTime = 12 /* ms of a frame for it */
 
@@ -57,6 +57,7 @@ export class Plane {
 	#tableOf = ''
 	#pixels = null
 	#rest = null
+	#behind = false /* not in sight, and not drawn as the view is now */
 
 	/*
 	 * shown(): called after each picture; step(direction): another iteration is asked for; pointed(point): the mouse is at
@@ -169,7 +170,7 @@ export class Plane {
 			this.#setDepth()
 		if (changed.tile)
 			this.enlarge.setAttribute('aria-pressed', String(this.#view.tile === this.name))
-		if (changed.position || changed.grid || changed.window || changed.level || changed.turn || changed.slab)
+		if (changed.position || changed.grid || changed.window || changed.level || changed.turn || changed.slab || (changed.tile && this.#behind))
 			this.draw()
 		if (changed.position || changed.grid || changed.zoom || changed.pan || changed.tile || changed.main || changed.turn)
 			this.place()
@@ -205,6 +206,11 @@ export class Plane {
 
 	#draw() {
 		if (this.#source === null || !this.element.isConnected)
+			return
+		/* Behind another plane; the rendering alone still waits for one of them. */
+		const { tile } = this.#view
+		this.#behind = tile !== 'all' && tile !== '3d' && tile !== this.name
+		if (this.#behind)
 			return
 		this.#place()
 		if (this.#grid)
@@ -253,7 +259,7 @@ export class Plane {
 	#drawSamples() {
 		const view = this.#view, grid = this.#grid, frame = view.frame(this.name), { slab } = view
 		const fine = this.#pitch(), samples = frame.width * frame.height / fine ** 2 * layersOf(frame, slab, grid)
-		const coarse = fine * Math.max(1, Math.sqrt(samples / quickMost))
+		const coarse = fine * Math.max(1, Math.sqrt(samples / (view.tile === this.name ? quickMost : quickMost / 3)))
 		this.#sample(frame, coarse, slab)
 		if (coarse > fine)
 			this.#rest = setTimeout(() => this.#refine(frame, fine, slab), restTime)
