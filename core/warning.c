@@ -89,6 +89,7 @@ const struct warning_kind warning_kinds[] = {
     {"damaged_volume", SEVERITY_SERIOUS, "The disk has damaged this image: it must be made again."},
     {"damaged_checkpoint", SEVERITY_INFO,
      "What the job had saved for a restart was damaged on the disk and was left out; the result is the same."},
+    {"fewer_devices", SEVERITY_INFO, "The job was computed on fewer devices than it asked for."},
     {"processor_fallback", SEVERITY_CAUTION,
      "The device that should have made the image failed: it is made by the processor, which takes longer; the result "
      "is the same."},

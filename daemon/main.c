@@ -208,16 +208,18 @@ static int start_parts(const struct config *config, struct api *api, struct erro
 					      .authorities = config->fleet_authorities,
 					      .host = fleet.host,
 					      .lease = config->fleet_lease};
-	const struct supervise_options supervise = {.remote = remote,
-						    .worker = config->worker[0] != '\0' ? config->worker : NULL,
-						    .backend = config->backend,
-						    .workers = given > 0 ? given : (int)config->workers,
-						    .devices = given > 0 ? devices : NULL,
-						    .threads = (int)config->threads,
-						    .device_memory = config->device_memory,
-						    .fallback = strcmp(config->fallback, "cpu") == 0,
-						    .checkpoint_seconds = config->checkpoint_seconds,
-						    .stop_seconds = config->stop_timeout};
+	const struct supervise_options supervise = {
+	    .remote = remote,
+	    .worker = config->worker[0] != '\0' ? config->worker : NULL,
+	    .backend = config->backend,
+	    .workers = given > 0 ? given : (int)config->workers,
+	    .devices = given > 0 ? devices : NULL,
+	    .devices_per_job = config->devices_per_job > 0 ? (int)config->devices_per_job : DEVICES_ALL,
+	    .threads = (int)config->threads,
+	    .device_memory = config->device_memory,
+	    .fallback = strcmp(config->fallback, "cpu") == 0,
+	    .checkpoint_seconds = config->checkpoint_seconds,
+	    .stop_seconds = config->stop_timeout};
 	const struct calibrations_options calibrations = {
 	    .worker = supervise.worker, .threads = (int)config->threads, .age = config->calibration_age};
 	const struct sendings_options sendings = {

@@ -10,6 +10,9 @@
  * and reads them from the file, which the daemon has just written. It dies with the
  * daemon, and it may die alone: what it has announced stays.
  *
+ * For a job on several devices the worker opens all of them, beside its own, and closes them when the job has ended.
+ * The workers that the others belong to have nothing to do meanwhile (daemon/jobs/lend.c).
+ *
  * With --calibrate it makes one calibration and ends. With --self-test it tries its device before it says hello, and
  * ends where that fails: how the daemon asks whether a device that failed may be used again.
  */
@@ -24,6 +27,7 @@
 #include <time.h>
 #include <unistd.h>
 
+#include "core/cards/cards.h"
 #include "core/recon/self_test.h"
 #include "proto/calibration_files.h"
 #include "proto/checkpoint.h"
@@ -62,6 +66,7 @@ struct worker {
 	int socket;
 	const struct backend *backend;
 	struct device *device;
+	struct device_options options;
 	struct heartbeat *heartbeat;
 
 	char job[64]; /* that runs */
@@ -335,11 +340,54 @@ static int push_arrivals(struct worker *worker, struct reconstruction *reconstru
 	return code;
 }
 
-static int run_reconstruction(struct worker *worker, const struct reconstruction_options *options, bool arriving,
-			      struct error *err)
+/* The devices of a job that runs: its backend, and the device that all of them make. */
+struct devices {
+	const struct backend *backend;
+	struct device *device;
+	int count, numbers[CARDS_MOST];
+};
+
+/* The worker's own device, or those that the message names. */
+static int open_devices(const struct worker *worker, const char *names, struct devices *ret, struct error *err)
+{
+	*ret = (struct devices){.backend = worker->backend, .device = worker->device};
+	if (names[0] == '\0')
+		return 0;
+	for (const char *at = names; ret->count < CARDS_MOST; at++) {
+		char *end;
+
+		ret->numbers[ret->count++] = (int)strtol(at, &end, 10);
+		at = end;
+		if (*at != ',')
+			break;
+	}
+	ret->backend = &backend_cards;
+	return cards_open(worker->backend, ret->numbers, ret->count, &worker->options, &ret->device, err);
+}
+
+static void close_devices(const struct worker *worker, struct devices *devices)
+{
+	if (devices->device != worker->device)
+		backend_cards.close(devices->device);
+}
+
+/* The error of a device names it; returns its place among the job's. */
+static int name_device(struct devices *devices, struct error *err)
+{
+	const int place = devices->count > 0 ? cards_failed(devices->device) : -1;
+	const struct error failed = *err;
+
+	if (place < 0)
+		return 0;
+	error_set(err, ERR_DEVICE, "device %d: %.280s", devices->numbers[place], failed.text);
+	return place;
+}
+
+static int run_reconstruction(struct worker *worker, const struct devices *devices,
+			      const struct reconstruction_options *options, bool arriving, struct error *err)
 {
 	struct reconstruction *reconstruction = NULL;
-	int code = reconstruction_open(worker->backend, worker->device, options, &reconstruction, err);
+	int code = reconstruction_open(devices->backend, devices->device, options, &reconstruction, err);
 
 	if (code == 0 && arriving) {
 		code = push_arrivals(worker, reconstruction, err);
@@ -353,7 +401,8 @@ static int run_reconstruction(struct worker *worker, const struct reconstruction
 	return code;
 }
 
-static int run_job(struct worker *worker, const struct message *start, struct error *err)
+/* *ret_card: of MESSAGE_ENDED. */
+static int run_job(struct worker *worker, const struct message *start, int *ret_card, struct error *err)
 {
 	const struct reconstruction_hooks hooks = {.recon = {.context = worker,
 							     .cancelled = on_cancelled,
@@ -381,6 +430,7 @@ static int run_job(struct worker *worker, const struct message *start, struct er
 						 .checkpoint_seconds = start->checkpoint_seconds,
 						 .hooks = &hooks};
 	unsigned char *present = NULL;
+	struct devices devices;
 	char checkpoint[1100];
 	int code;
 
@@ -395,7 +445,13 @@ static int run_job(struct worker *worker, const struct message *start, struct er
 			present[i] = start->present[i / 8] >> i % 8 & 1;
 		options.present = present;
 	}
-	code = run_reconstruction(worker, &options, start->arriving, err);
+	code = open_devices(worker, start->cards, &devices, err);
+	if (code == 0) {
+		code = run_reconstruction(worker, &devices, &options, start->arriving, err);
+		if (code == ERR_DEVICE)
+			*ret_card = name_device(&devices, err);
+		close_devices(worker, &devices);
+	}
 	free(present);
 	return code;
 }
@@ -417,7 +473,7 @@ static int serve_job(struct worker *worker, const struct message *start)
 	worker->trouble = (struct error){0};
 	worker->step = 0;
 	heartbeat_step(worker->heartbeat, OPEN_SECONDS);
-	ended.code = run_job(worker, start, &err);
+	ended.code = run_job(worker, start, &ended.card, &err);
 	heartbeat_step(worker->heartbeat, 0);
 	if (worker->trouble.code != 0) {
 		err = worker->trouble;
@@ -489,6 +545,7 @@ static int open_device(struct worker *worker, const struct arguments *arguments,
 	/* All workers without devices of their own share the processor. */
 	code = worker->backend->open(worker->backend->own_memory ? arguments->device : 0, &arguments->options,
 				     &worker->device, err);
+	worker->options = arguments->options;
 	if (code == 0 && arguments->self_test)
 		code = device_self_test(worker->backend, worker->device, err);
 	if (code != 0)

@@ -50,6 +50,7 @@ static const struct field start_fields[] = {FIELD("job", FIELD_STRING, job),
 					    FIELD("request", FIELD_REQUEST, request),
 					    FIELD("iteration", FIELD_INT, iteration),
 					    FIELD("checkpoint_seconds", FIELD_NUMBER, checkpoint_seconds),
+					    FIELD("cards", FIELD_STRING, cards),
 					    FIELD("arriving", FIELD_BOOL, arriving),
 					    FIELD("reduced", FIELD_BOOL, reduced),
 					    FIELD("present", FIELD_BITS, present),
@@ -128,11 +129,9 @@ static const struct field stopped_fields[] = {FIELD("job", FIELD_STRING, job),
 					      {0}};
 static const struct field warning_fields[] = {
     FIELD("job", FIELD_STRING, job), FIELD("code", FIELD_STRING, code_name), FIELD("detail", FIELD_STRING, text), {0}};
-static const struct field ended_fields[] = {FIELD("job", FIELD_STRING, job),
-					    FIELD("code", FIELD_INT, code),
-					    FIELD("iteration", FIELD_INT, iteration),
-					    FIELD("text", FIELD_STRING, text),
-					    {0}};
+static const struct field ended_fields[] = {FIELD("job", FIELD_STRING, job),          FIELD("code", FIELD_INT, code),
+					    FIELD("iteration", FIELD_INT, iteration), FIELD("text", FIELD_STRING, text),
+					    FIELD("card", FIELD_INT, card),           {0}};
 
 static const struct {
 	const char *name;

@@ -14,8 +14,8 @@ enum message_kind {
 	/* daemon -> worker */
 	/*
 	 * job, scan_directory, job_directory, recipe, iteration (0, or resume from the checkpoint), checkpoint_seconds,
-	 * reduced and present, arriving: the projections come by MESSAGE_VIEWS; otherwise all that are present are
-	 * there
+	 * cards, reduced and present, arriving: the projections come by MESSAGE_VIEWS; otherwise all that are present
+	 * are there
 	 */
 	MESSAGE_START,
 	/*
@@ -46,7 +46,11 @@ enum message_kind {
 	MESSAGE_AGREEMENT,     /* job, agreement: how well the projections agree with the geometry */
 	MESSAGE_STOPPED,       /* job, stop: how automatic iterations ended */
 	MESSAGE_WARNING,       /* job, code, detail */
-	MESSAGE_ENDED, /* job, code (0, ERR_CANCELLED, ERR_BUSY = yielded at `iteration`, or what failed), text */
+	/*
+	 * job, code (0, ERR_CANCELLED, ERR_BUSY = yielded at `iteration`, or what failed), text; with ERR_DEVICE card,
+	 * the place in `cards` of the device that failed
+	 */
+	MESSAGE_ENDED,
 	MESSAGE_KIND_COUNT
 };
 
@@ -55,12 +59,13 @@ struct message {
 	char job[64];
 	char scan_directory[1024], job_directory[1024];
 	struct job_request request; /* START; recipe owned by the message: message_clear */
+	char cards[64];             /* numbers of the devices that work together, "0,2"; "": the worker's own alone */
 	bool arriving, reduced;
 	double checkpoint_seconds;
 	uint8_t present[(VIEWS_MAX + 7) / 8]; /* START with `reduced`: bit k % 8 of byte k / 8 for projection k */
 	int count;
 	struct device_info info;
-	char backend[16], plan[160];
+	char backend[16], plan[320];
 	struct recon_memory memory;
 	enum stage stage;
 	int iteration;
@@ -78,7 +83,7 @@ struct message {
 	struct volume_support support;
 	size_t bytes;
 	char code_name[64], text[512]; /* WARNING: code and detail; ENDED: text */
-	int code;
+	int code, card;
 };
 
 enum { MESSAGE_BYTES_MAX = 200000 };

@@ -10,13 +10,14 @@
 #include <stdlib.h>
 #include <string.h>
 
+#include "core/cards/cards.h"
 #include "core/recon/parameters.h"
 #include "proto/parameter.h"
 #include "proto/preset.h"
 
 const char *const priority_names[PRIORITY_COUNT] = {"routine", "urgent", "stat"};
 
-/* The one parameter of struct job_request itself; the others are the recipe's. */
+/* The parameters of struct job_request itself; the others are the recipe's. */
 const struct parameter priority_parameter = {"",
 					     "priority",
 					     PARAMETER_CHOICE,
@@ -24,6 +25,17 @@ const struct parameter priority_parameter = {"",
 					     .names = priority_names,
 					     .count = PRIORITY_COUNT,
 					     .help = "A job of higher priority goes before others in the queue."};
+const struct parameter devices_parameter = {
+    "",
+    "devices",
+    PARAMETER_INTEGER,
+    .offset = offsetof(struct job_request, devices),
+    .least = 1,
+    .most = CARDS_MOST,
+    .presets = PRESET_OPEN,
+    .word = "all",
+    .help = "Devices of one host that the job has for itself; all takes what is there; by default as many as the "
+	    "daemon's --devices-per-job says."};
 
 /* The recipe's parameters that are members of `object`. */
 static struct parameter_set members_of(const char *object)
@@ -32,6 +44,15 @@ static struct parameter_set members_of(const char *object)
 				      .count = recipe_parameter_count,
 				      .object = object,
 				      .counting = strcmp(object, OBJECT_ALGORITHM) == 0};
+}
+
+struct where job_request_where(const struct job_request *request)
+{
+	struct where where = request->where;
+
+	if (request->devices > 1 && request->devices > where.devices)
+		where.devices = request->devices;
+	return where;
 }
 
 void job_request_clear(struct job_request *request)
@@ -245,6 +266,7 @@ static int read_members(struct job_request *request, const cJSON *value, struct 
 		recipe_set_algorithm(&request->recipe, &algorithm_sart);
 	}
 	json_parameter(&reader, &priority_parameter, "priority", request);
+	json_parameter(&reader, &devices_parameter, "devices", request);
 	json_parameters(&reader, &set, &request->recipe);
 	read_emit(&reader, &request->recipe);
 	return json_end(&reader);
@@ -409,10 +431,19 @@ cJSON *recipe_json(const struct recipe *recipe)
 
 bool job_request_same(const struct job_request *a, const struct job_request *b)
 {
-	return strcmp(a->scan, b->scan) == 0 && a->priority == b->priority && patient_same(&a->patient, &b->patient) &&
+	return strcmp(a->scan, b->scan) == 0 && a->priority == b->priority && a->devices == b->devices &&
+	       patient_same(&a->patient, &b->patient) &&
 	       strcmp(a->labels != NULL ? a->labels : "", b->labels != NULL ? b->labels : "") == 0 &&
 	       strcmp(a->send != NULL ? a->send : "", b->send != NULL ? b->send : "") == 0 &&
 	       where_same(&a->where, &b->where) && a->resume == b->resume && recipe_same(&a->recipe, &b->recipe);
+}
+
+/* As resolved; a request that leaves it open has no such member. */
+static bool add_devices(cJSON *document, const struct job_request *request)
+{
+	const struct parameter_set set = {.parameters = &devices_parameter, .count = 1, .object = ""};
+
+	return parameters_add(document, &set, request);
 }
 
 cJSON *job_request_json(const struct job_request *request)
@@ -426,7 +457,8 @@ cJSON *job_request_json(const struct job_request *request)
 	    (where_is_any(&request->where) || add(document, "where", where_json(&request->where))) &&
 	    (request->resume == 0 || add(document, "resume", cJSON_CreateNumber(request->resume))) &&
 	    add_emit(document, &request->recipe) &&
-	    add(document, "priority", cJSON_CreateString(priority_names[request->priority])))
+	    add(document, "priority", cJSON_CreateString(priority_names[request->priority])) &&
+	    add_devices(document, request))
 		return document;
 	cJSON_Delete(document);
 	return NULL;
@@ -465,7 +497,8 @@ cJSON *job_parameters_json(void)
 	recipe_defaults(&request.recipe);
 	for (int i = 0; i < recipe_parameter_count && added; i++)
 		added = add_rows(list, &recipe_parameters[i], &request.recipe);
-	if (added && add_row(list, &priority_parameter, NULL, &request))
+	if (added && add_row(list, &priority_parameter, NULL, &request) &&
+	    add_row(list, &devices_parameter, NULL, &request))
 		return list;
 	cJSON_Delete(list);
 	return NULL;

@@ -10,7 +10,9 @@
 
 enum priority { PRIORITY_ROUTINE, PRIORITY_URGENT, PRIORITY_STAT, PRIORITY_COUNT };
 extern const char *const priority_names[PRIORITY_COUNT];
-extern const struct parameter priority_parameter; /* of struct job_request */
+/* Of struct job_request itself. */
+extern const struct parameter priority_parameter, devices_parameter;
+enum { DEVICES_ALL = PARAMETER_WORD };
 
 /* The document of POST /v1/jobs. */
 struct job_request {
@@ -21,11 +23,14 @@ struct job_request {
 	/* Destination that is told of the job's performed procedure step, "": none; the daemon's, not in the document.
 	 */
 	char step_to[DESTINATION_NAME_SIZE];
+	int devices; /* of one host, that work together; DEVICES_ALL: all that it has; 0: the daemon's default */
 	struct where where;
 	int resume;             /* the job begins behind that iteration, with a checkpoint sent to it; 0: it does not */
 	struct patient patient; /* of the scan, once resolved, unless the job says otherwise */
 	struct recipe recipe;   /* owned */
 };
+/* "where", with as many devices as the job has. */
+struct where job_request_where(const struct job_request *request);
 void job_request_clear(struct job_request *request);
 int job_request_copy(struct job_request *ret_request, const struct job_request *request, struct error *err);
 

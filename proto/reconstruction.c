@@ -15,6 +15,7 @@
 #include <unistd.h>
 
 #include "core/algebra.h"
+#include "core/cards/cards.h"
 #include "core/recon/algorithm.h"
 #include "core/correct/rings.h"
 #include "core/correct/scatter_images.h"
@@ -729,7 +730,9 @@ static int set_provenance(struct reconstruction *reconstruction, const struct re
 	set_text(provenance->scan, sizeof(provenance->scan), options->scan);
 	set_text(provenance->scan_name, sizeof(provenance->scan_name), scan->name);
 	set_text(provenance->commit, sizeof(provenance->commit), program_commit);
-	set_text(provenance->backend, sizeof(provenance->backend), reconstruction->backend->name);
+	set_text(provenance->backend, sizeof(provenance->backend),
+		 reconstruction->backend == &backend_cards ? cards_below(reconstruction->device)->name
+							   : reconstruction->backend->name);
 	reconstruction->backend->describe(reconstruction->device, &info);
 	set_text(provenance->device, sizeof(provenance->device), info.name);
 	provenance->recipe = recipe_json(options->recipe);

@@ -186,6 +186,7 @@ void recipe_options_make(void)
 			add_option(parameter, runs ? algorithms[k] : NULL);
 	}
 	add_option(&priority_parameter, NULL);
+	add_option(&devices_parameter, NULL);
 	recipe_option_rows[entry_count] = (struct option){
 	    "no-fdk", 0, OPTION_FLAG, offsetof(struct recipe_options, no_fdk), NULL, "start from zero", 0, 0, 0, NULL};
 	recipe_option_rows[entry_count + 1] =

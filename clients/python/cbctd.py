@@ -119,6 +119,7 @@ _PARAMETERS: Dict[str, Dict[str, Document]] = {
         "/precision": {"type": "choice", "choices": ["standard", "reference"]},
         "/mu_water": {"type": "number", "minimum": 1e-09, "maximum": 1000},
         "/priority": {"type": "choice", "choices": ["routine", "urgent", "stat"]},
+        "/devices": {"type": "integer", "minimum": 1, "maximum": 16, "word": "all"},
     },
     "scan": {
         "/detector/columns": {"type": "integer", "minimum": 1, "maximum": 16384},

@@ -118,6 +118,23 @@ static int cards_sync(struct device *device, struct error *err)
 	return crew_run(device->crew, sync_card, device, err);
 }
 
+const struct backend *cards_below(const struct device *device)
+{
+	return device->backend;
+}
+
+int cards_failed(struct device *device)
+{
+	struct error ignored;
+	int failed = crew_failed(device->crew);
+
+	/* Calls outside of the crew may have met it; a card that has failed says so from then on. */
+	for (int c = 0; c < device->count && failed < 0; c++)
+		if (device->backend->sync(device->card[c], &ignored) == ERR_DEVICE)
+			failed = c;
+	return failed;
+}
+
 /* ---- from card to card ---- */
 
 int cards_exchange(struct device *device, crew_work *work, void *context, struct error *err)

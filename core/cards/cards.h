@@ -29,5 +29,9 @@ enum { CARDS_MOST = 16 };
  */
 int cards_open(const struct backend *backend, const int *indices, int count, const struct device_options *options,
 	       struct device **ret_device, struct error *err);
+/* The backend below. */
+const struct backend *cards_below(const struct device *device);
+/* The place in the list of the card that failed, once something has ended in ERR_DEVICE; -1: none of them says so. */
+int cards_failed(struct device *device);
 
 #endif

@@ -22,6 +22,7 @@ struct crew {
 	pthread_cond_t begin, end;
 	unsigned long round; /* counts the works */
 	int busy;            /* members that have not done this one */
+	int failed;          /* crew_failed; the caller's thread alone */
 	bool stop;
 	crew_work *work;
 	void *context;
@@ -63,6 +64,7 @@ int crew_new(int cards, struct crew **ret_crew, struct error *err)
 	if (crew == NULL)
 		return error_set(err, ERR_NO_MEMORY, "no memory for the threads of %d cards", cards);
 	crew->cards = cards;
+	crew->failed = -1;
 	pthread_mutex_init(&crew->lock, NULL);
 	pthread_cond_init(&crew->begin, NULL);
 	pthread_cond_init(&crew->end, NULL);
@@ -114,8 +116,15 @@ int crew_run(struct crew *crew, crew_work *work, void *context, struct error *er
 	for (int i = 0; i < crew->cards; i++) {
 		if (crew->member[i].code < 0) {
 			*err = crew->member[i].err;
+			if (err->code == ERR_DEVICE && crew->failed < 0)
+				crew->failed = i;
 			return err->code;
 		}
 	}
 	return 0;
+}
+
+int crew_failed(const struct crew *crew)
+{
+	return crew->failed;
 }

@@ -336,6 +336,16 @@ static void add_waiting_for(cJSON *document, const struct scan_facts *scan, cons
 		cJSON_AddItemToArray(list, cJSON_CreateString("worker"));
 }
 
+/* The numbers of the devices in GET /v1/devices. */
+static void add_ran_on(cJSON *document, const char *text)
+{
+	cJSON *list = cJSON_AddArrayToObject(document, "ran_on");
+	char *end;
+
+	for (const char *at = text; *at != '\0'; at = *end == ',' ? end + 1 : end)
+		cJSON_AddItemToArray(list, cJSON_CreateNumber((double)strtol(at, &end, 10)));
+}
+
 static void add_job_facts(cJSON *document, struct job *job, const struct job_record *record)
 {
 	bool works = record->state == JOB_RUNNING || record->attended;
@@ -361,6 +371,7 @@ static void add_job_facts(cJSON *document, struct job *job, const struct job_rec
 	add_number_or_null(document, "queue_position", position > 0 ? position : -1);
 	add_text_or_null(document, "backend", record->backend);
 	add_text_or_null(document, "device", record->device);
+	add_ran_on(document, record->ran_on);
 	add_text_or_null(document, "plan", record->plan);
 	add_memory(document, &record->memory);
 	add_denoising(document, record);

@@ -66,6 +66,8 @@ static void weigh_job(struct fleet *fleet, struct job *job, bool clean, struct l
 	const struct fleet_claim *claim;
 	struct job_record record;
 	const char *key;
+	struct job_facts facts;
+	int devices;
 	bool waits;
 
 	job_record(job, &record);
@@ -80,8 +82,10 @@ static void weigh_job(struct fleet *fleet, struct job *job, bool clean, struct l
 	}
 	if (job_state_ended(record.state) || waits || is_given(fleet, record.id))
 		return;
+	job_facts(job, &facts);
+	devices = facts.devices == DEVICES_ALL ? fleet_devices(fleet, false) : facts.devices;
 	for (int i = 0; i <= (int)record.priority; i++)
-		load->used[i]++;
+		load->used[i] += devices > 1 ? devices : 1;
 }
 
 void fleet_weigh(struct fleet *fleet, bool clean, struct load *ret_load)

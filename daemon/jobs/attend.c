@@ -13,10 +13,8 @@ void worker_stop_attending(struct worker *worker)
 
 int worker_record_running(struct worker *worker, struct error *err)
 {
-	const struct job_change change = {.backend = worker->backend,
-					  .device = worker->info.name,
-					  .basis = worker->basis,
-					  .reason = "its last projection is there"};
+	const struct job_change change = {
+	    .backend = worker->backend, .basis = worker->basis, .reason = "its last projection is there"};
 	struct job_record record;
 	int code = job_set_state(worker->job, JOB_RUNNING, &change, err);
 

@@ -146,8 +146,7 @@ static bool other_answers(const struct supervise *supervise, const struct worker
 	return false;
 }
 
-/* Set aside, or DEVICE_FAULTS processes in a row have ended without a hello, as without a driver. */
-static bool is_out(const struct worker *worker)
+bool device_is_out(const struct worker *worker)
 {
 	return worker->aside || worker->mute > DEVICE_FAULTS;
 }
@@ -155,7 +154,7 @@ static bool is_out(const struct worker *worker)
 static bool all_out(const struct supervise *supervise)
 {
 	for (int i = 0; i < supervise->regular; i++) {
-		if (!is_out(&supervise->workers[i]))
+		if (!device_is_out(&supervise->workers[i]))
 			return false;
 	}
 	return true;
@@ -164,18 +163,20 @@ static bool all_out(const struct supervise *supervise)
 enum route device_route(struct supervise *supervise, struct worker *worker, enum worker_end end)
 {
 	struct job_trial *trial = job_trial(worker->job);
-	const unsigned long long here = worker->fallback ? 0 : 1ull << worker->index;
+	/* The device that is at fault may be one of several that the job had. */
+	const struct worker *card = worker_failed_card(worker);
+	const unsigned long long here = worker->fallback ? 0 : 1ull << card->index;
 	struct job_record record;
 	struct route_facts facts;
 	enum route route;
 
 	job_record(worker->job, &record);
-	trial->deaths = trial->worker == worker->index && record.crashes > 0 ? trial->deaths + 1 : 1;
-	trial->worker = worker->index;
+	trial->deaths = trial->worker == card->index && record.crashes > 0 ? trial->deaths + 1 : 1;
+	trial->worker = card->index;
 	facts = (struct route_facts){.device_error = device_at_fault(worker, end),
 				     .deaths = trial->deaths,
 				     .runs = record.crashes + 1,
-				     .other = !worker->fallback && other_answers(supervise, worker, trial->left),
+				     .other = !worker->fallback && other_answers(supervise, card, trial->left),
 				     .processor = supervise->options.fallback && !worker->fallback};
 	route = route_of(&facts);
 	if (route == ROUTE_OTHER)
@@ -282,11 +283,14 @@ static void tell_devices(struct supervise *supervise)
 		return;
 	memcpy(supervise->memory, memory, (size_t)count * sizeof(*memory));
 	supervise->memory_count = count;
-	jobs_set_devices(supervise->jobs, supervise->options.remote.host, memory, count);
+	/* Without other hosts a job that was posted when there were more devices goes on with those that are left. */
+	jobs_set_devices(supervise->jobs, supervise->options.remote.host, memory, count,
+			 supervise->options.remote.program != NULL ? supervise->regular : CARDS_MOST);
 }
 
 void devices_tend(struct supervise *supervise)
 {
+	devices_return(supervise);
 	tell_devices(supervise);
 	clear_asked(supervise);
 	if (supervise->options.fallback)
@@ -342,8 +346,9 @@ static void add_starved(cJSON *report, const struct worker *worker)
 		cJSON_AddNullToObject(object, "limit");
 }
 
-char *device_report(const struct worker *worker, const struct worker_words *words, int runs)
+char *device_report(struct worker *worker, const struct worker_words *words, int runs)
 {
+	const struct worker *card = worker_failed_card(worker);
 	cJSON *document = cJSON_CreateObject(), *device;
 	char kernel[240], *text;
 	int number = 0;
@@ -359,11 +364,11 @@ char *device_report(const struct worker *worker, const struct worker_words *word
 	add_text(document, "kernel", kernel);
 	add_starved(document, worker);
 	device = cJSON_AddObjectToObject(document, "device");
-	cJSON_AddNumberToObject(device, "index", worker->index);
-	add_text(device, "name", worker->info.name);
-	add_text(device, "driver", worker->info.driver);
-	cJSON_AddNumberToObject(device, "errors", worker->faults);
-	cJSON_AddBoolToObject(device, "set_aside", worker->aside);
+	cJSON_AddNumberToObject(device, "index", card->index);
+	add_text(device, "name", card->info.name);
+	add_text(device, "driver", card->info.driver);
+	cJSON_AddNumberToObject(device, "errors", card->faults);
+	cJSON_AddBoolToObject(device, "set_aside", card->aside);
 	text = json_print(document, NULL);
 	cJSON_Delete(document);
 	return text;

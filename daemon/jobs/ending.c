@@ -204,8 +204,8 @@ static void carry_out(struct supervise *supervise, struct worker *worker, const 
 	if (outcome->warn)
 		job_add_warning(worker->job, "damaged_checkpoint", words->text, &ignored);
 	hold_job(supervise, worker, outcome->obstacle);
-	if (outcome->to == JOB_SUCCEEDED)
-		worker->failures = worker->faults = 0;
+	for (int i = 0; i < worker->card_count && outcome->to == JOB_SUCCEEDED; i++)
+		worker->cards[i]->failures = worker->cards[i]->faults = 0;
 }
 
 /* The words that a failed job bears, and the log otherwise. */
@@ -227,8 +227,7 @@ static void write_text(const struct worker *worker, const struct outcome *outcom
 	snprintf(ret_text, size, "%.319s", outcome->reason != NULL ? outcome->reason : text);
 }
 
-static void write_report(const struct worker *worker, const struct worker_words *words,
-			 char ret_report[JOB_REPORT_SIZE])
+static void write_report(struct worker *worker, const struct worker_words *words, char ret_report[JOB_REPORT_SIZE])
 {
 	struct job_record record;
 	char *report;
@@ -258,7 +257,7 @@ static void end_job(struct supervise *supervise, struct worker *worker, const st
 		worker->deadline = clock_monotonic() + EXIT;
 	}
 	if (fault && words->end != END_STOPPED)
-		device_fault(supervise, worker, words->text);
+		device_fault(supervise, worker_failed_card(worker), words->text);
 	carry_out(supervise, worker, &outcome, words);
 	if (outcome.to == JOB_FAILED && outcome.crashed)
 		write_report(worker, words, ending.report);

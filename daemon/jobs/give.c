@@ -78,14 +78,23 @@ static int make_start(struct supervise *supervise, const struct job *job, const 
 	return code;
 }
 
+/* The devices that a job is to have. */
+struct chosen {
+	struct worker *cards[CARDS_MOST];
+	int count;
+	struct device_names names;
+};
+
 static void begin(struct supervise *supervise, struct worker *worker, struct job *job, const struct job_record *record,
-		  const struct message *message)
+		  const struct message *message, const struct chosen *chosen)
 {
 	struct error err;
 
 	worker->said[0] = '\0';
 	worker->job = job_reference(job);
-	worker->running = (struct queue_running){.priority = record->priority, .ticket = record->ticket};
+	worker->running =
+	    (struct queue_running){.priority = record->priority, .ticket = record->ticket, .devices = chosen->count};
+	devices_lend(supervise, worker, chosen->cards, chosen->count);
 	worker->checkpoint = message->iteration;
 	worker->volume_bytes = grid_voxels(&message->request.recipe.grid) * sizeof(float);
 	worker->unsettled = 0;
@@ -122,16 +131,18 @@ static double just_now(const struct worker *worker)
 /* Sets the job running with all projections, or, `arriving`, has it attended while the rest comes. */
 static int begin_job(struct supervise *supervise, struct worker *worker, struct job *job,
 		     const struct job_record *record, struct message *message, struct stored_scan *scan,
-		     const struct scan_facts *facts, bool arriving, struct error *err)
+		     const struct scan_facts *facts, const struct chosen *chosen, bool arriving, struct error *err)
 {
-	const struct job_change change = {
-	    .backend = worker->backend, .device = worker->info.name, .basis = facts->basis};
+	const struct job_change change = {.backend = worker->backend,
+					  .device = chosen->names.device,
+					  .ran_on = chosen->names.ran_on,
+					  .basis = facts->basis};
 	const double since = just_now(worker);
 	int code;
 
 	message->arriving = arriving;
 	if (arriving)
-		code = job_attend(job, worker->backend, worker->info.name, err);
+		code = job_attend(job, &change, err);
 	else
 		code = job_set_state(job, JOB_RUNNING, &change, err);
 	if (code != 0) {
@@ -140,8 +151,9 @@ static int begin_job(struct supervise *supervise, struct worker *worker, struct 
 	}
 	worker->basis = facts->basis;
 	worker->losses = facts->losses;
-	begin(supervise, worker, job, record, message);
+	begin(supervise, worker, job, record, message, chosen);
 	worker->work = (double)grid_voxels(&message->request.recipe.grid) * facts->count;
+	devices_tell_fewer(worker, job_trial(job), chosen->count);
 	if (worker->fallback)
 		device_tell_fallback(supervise, worker,
 				     record->iterations > message->iteration ? record->iterations - message->iteration
@@ -158,8 +170,8 @@ static int begin_job(struct supervise *supervise, struct worker *worker, struct 
 }
 
 /* A job to this idle worker; a code when no more can be given just now. */
-static int give_job(struct supervise *supervise, struct worker *worker, struct job *job, bool arriving,
-		    struct error *err)
+static int give_job(struct supervise *supervise, struct worker *worker, struct job *job, const struct chosen *chosen,
+		    bool arriving, struct error *err)
 {
 	struct message *message = calloc(1, sizeof(*message));
 	struct stored_scan *scan;
@@ -193,7 +205,8 @@ static int give_job(struct supervise *supervise, struct worker *worker, struct j
 		change = (struct job_change){.error_code = code, .error_pointer = why.pointer, .error_text = why.text};
 		code = job_set_state(job, JOB_FAILED, &change, err);
 	} else {
-		code = begin_job(supervise, worker, job, &record, message, scan, &facts, arriving, err);
+		memcpy(message->cards, chosen->names.cards, sizeof(message->cards));
+		code = begin_job(supervise, worker, job, &record, message, scan, &facts, chosen, arriving, err);
 		message_clear(message);
 	}
 	free(message);
@@ -229,16 +242,27 @@ void supervise_dispatch(struct supervise *supervise)
 
 	for (int i = 0; i < supervise->count && code == 0;) {
 		struct worker *worker = &supervise->workers[i];
+		struct chosen chosen = {.count = 0};
 		struct job *job = NULL;
 		bool arriving = false;
 
-		if (worker->state == WORKER_IDLE && worker->job == NULL)
+		if (worker_is_free(worker))
 			job = choose_job(supervise, worker, &arriving);
-		if (job == NULL) {
+		if (job != NULL)
+			chosen.count = devices_choose(worker, job_trial(job), chosen.cards);
+		/*
+		 * The first job whose devices are not all free keeps those that are, so that jobs of single devices
+		 * never go before it for ever.
+		 */
+		if (chosen.count == 0) {
+			if (job != NULL && !arriving)
+				job_lacks_devices(job);
+			job_release(job);
 			i++;
 			continue;
 		}
-		code = give_job(supervise, worker, job, arriving, &err);
+		devices_name(worker, chosen.cards, chosen.count, &chosen.names);
+		code = give_job(supervise, worker, job, &chosen, arriving, &err);
 		job_release(job);
 	}
 	if (code != 0) {
@@ -256,9 +280,12 @@ void supervise_preempt(struct supervise *supervise)
 	const struct job_filter any = {.fits = devices_fit, .context = supervise};
 	struct job *waiting = jobs_arriving(supervise->jobs, since, &any, &arriving);
 	struct job_facts facts = {.priority = PRIORITY_ROUTINE};
+	struct queue_entry coming = {.devices = 1};
 
-	if (waiting != NULL)
+	if (waiting != NULL) {
 		job_facts(waiting, &facts);
+		coming = (struct queue_entry){.priority = facts.priority, .devices = *job_trial(waiting)->devices};
+	}
 	job_release(waiting);
 	do {
 		busy = idle = 0;
@@ -266,7 +293,7 @@ void supervise_preempt(struct supervise *supervise)
 		for (int i = 0; i < supervise->local; i++) {
 			struct worker *worker = &supervise->workers[i];
 
-			idle += worker->state == WORKER_IDLE && worker->job == NULL;
+			idle += worker_is_free(worker);
 			if (worker->state != WORKER_BUSY || worker->job == NULL)
 				continue;
 			running[busy] = worker->running;
@@ -274,8 +301,8 @@ void supervise_preempt(struct supervise *supervise)
 			running[busy].gives_way = worker_patience_ends(worker) <= now;
 			of[busy++] = i;
 		}
-		victim = jobs_victim(supervise->jobs, waiting != NULL && arriving ? &facts.priority : NULL, running,
-				     busy, idle);
+		victim = jobs_victim(supervise->jobs, waiting != NULL && arriving ? &coming : NULL, running, busy, idle,
+				     devices_in_service(supervise));
 		if (victim >= 0) {
 			worker_order(&supervise->workers[of[victim]], MESSAGE_YIELD);
 			supervise->workers[of[victim]].yielding = true;

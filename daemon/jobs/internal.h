@@ -42,6 +42,7 @@ struct job {
 	int references; /* one of them is the array's */
 	bool removed;
 	bool stays;                    /* job_stay */
+	bool lacks_devices;            /* job_lacks_devices */
 	struct client *client;         /* constant; what it points to is not */
 	bool active;                   /* counted in its client's */
 	double charged;                /* monotonic: its time on a device is counted up to then */
@@ -89,7 +90,7 @@ struct jobs {
 	bool devices_known;
 	char host[WHERE_HOST_SIZE];
 	double device_bytes[WHERE_DEVICES_MOST];
-	int devices;
+	int devices, devices_most;
 };
 
 /* ---- jobs/offer.c ---- */
@@ -142,6 +143,8 @@ void job_wake(struct job *job);
 
 /* As job_set_state, with jobs->change held; the caller wakes the watchers after it. */
 int job_change_state(struct job *job, enum job_state to, const struct job_change *change, struct error *err);
+/* Where the job is to run, as far as the change says it. */
+void job_note_devices(struct job_record *record, const struct job_change *change);
 /* The time since the last call belongs to the stage that ran. jobs->lock is held. */
 void job_account_stage(struct job *job);
 

@@ -31,6 +31,7 @@ static struct job *job_new(struct jobs *jobs, struct job_record *record)
 	memcpy(job->scan, record->scan, sizeof(job->scan));
 	job->references = 1;
 	job->trial.where = &job->request.where;
+	job->trial.devices = &job->request.devices;
 	watch_list_init(&job->watchers);
 	return job;
 }
@@ -274,6 +275,7 @@ static int load_jobs(struct jobs *jobs, struct error *err)
 		}
 		read_request(job);
 		job->entry.client = &job->client->share;
+		job->entry.devices = job->request.devices;
 		job->bytes_known = !job_state_ended(job->record.state);
 		if (job->bytes_known)
 			job->kept_bytes = job_bytes_wanted(&job->request);
@@ -443,6 +445,7 @@ static int insert_job(struct jobs *jobs, struct job *job, struct stored_scan *sc
 	if (code != 0)
 		return code;
 	pthread_mutex_lock(&jobs->lock);
+	job->entry.devices = job->request.devices;
 	job->entry.client = &job->client->share;
 	job_place(job);
 	array_insert(jobs, job);
@@ -638,7 +641,8 @@ void job_facts(struct job *job, struct job_facts *ret)
 	ret->attended = job->record.attended;
 	ret->priority = job->record.priority;
 	ret->mu_water = job->record.mu_water;
-	ret->where = job->request.where;
+	ret->where = job_request_where(&job->request);
+	ret->devices = job->request.devices;
 	pthread_mutex_unlock(&job->jobs->lock);
 }
 

@@ -102,8 +102,9 @@ struct job_facts {
 	bool ended, removed;
 	bool cancel_asked, attended;
 	enum priority priority;
-	double mu_water; /* 1/mm */
-	struct where where;
+	double mu_water;    /* 1/mm */
+	struct where where; /* job_request_where */
+	int devices;        /* that it has, or wants; DEVICES_ALL */
 };
 void job_facts(struct job *job, struct job_facts *ret);
 
@@ -169,7 +170,8 @@ struct job_change {
 	bool crashed;                 /* to JOB_QUEUED, JOB_WAITING or JOB_FAILED: the worker died with it */
 	bool yielded;                 /* to JOB_QUEUED: it goes on later, which is no new attempt */
 	unsigned basis;               /* to JOB_RUNNING: of its scan; after another one it begins anew, its past goes */
-	const char *backend, *device; /* to JOB_RUNNING */
+	const char *backend, *device; /* to JOB_RUNNING, as the next; NULL: those that it has */
+	const char *ran_on;           /* job_record.ran_on */
 	const char *reason;           /* for the log */
 };
 /* ERR_CONFLICT when the table does not allow it; the caller's picture was old. change may be NULL. */
@@ -182,7 +184,8 @@ int jobs_promote(struct jobs *jobs, struct error *err);
  * daemon every device is worth a try.
  */
 struct job_trial {
-	const struct where *where; /* the job's own, constant */
+	const struct where *where; /* the job's own, constant, as the next */
+	const int *devices;        /* that it wants at once; job_request.devices */
 	int place;                 /* slot of the host that has claimed it (supervise.h), 0: none */
 	int given_back;            /* runs that other hosts have begun and not ended */
 	unsigned long long left;   /* bit for each worker whose device the job has left */
@@ -202,7 +205,7 @@ struct job_filter {
  */
 struct job *jobs_arriving(struct jobs *jobs, double since, const struct job_filter *filter, bool *ret_arriving);
 /* ERR_CONFLICT when it does not wait any more, or was cancelled. */
-int job_attend(struct job *job, const char *backend, const char *device, struct error *err);
+int job_attend(struct job *job, const struct job_change *change, struct error *err);
 /* The worker goes; a job that still waits is where it was before, or cancelled where that was asked for. */
 int job_leave(struct job *job, struct error *err);
 /*
@@ -225,9 +228,10 @@ enum job_obstacle {
 	JOB_NO_MEMORY,
 	JOB_NO_HOST,       /* by its "where" it may have no device here; it is not held for that */
 	JOB_NO_CHECKPOINT, /* that it is to begin with has not come; nor for that */
+	JOB_NO_DEVICES,    /* it is its turn, and not as many devices are free as it wants; nor for that */
 	JOB_OBSTACLE_COUNT
 };
-/* As in `waiting_for`: "space", "disk", "memory", "host", "checkpoint". */
+/* As in `waiting_for`: "space", "disk", "memory", "host", "checkpoint", "devices". */
 extern const char *const job_obstacle_names[JOB_OBSTACLE_COUNT];
 int job_hold(struct job *job, enum job_obstacle obstacle, double until, unsigned long long space);
 /* Releases held jobs whose time has come and for which the disk has room; true while others are still held. */
@@ -236,17 +240,20 @@ enum job_obstacle job_obstacle(struct job *job); /* any thread */
 struct job_trial *job_trial(struct job *job);
 /*
  * This host's name and the bytes that its devices have, of which each job's "where" says whether it may run here; until
- * it is called any job may.
+ * it is called any job may. A job that wants more than `most` devices may not, whatever some of them do just now.
  */
-void jobs_set_devices(struct jobs *jobs, const char *host, const double *memory, int count);
+void jobs_set_devices(struct jobs *jobs, const char *host, const double *memory, int count, int most);
 /* A job that has not ended waits for the processor. */
 bool jobs_want_processor(struct jobs *jobs);
+
+/* It was its turn, and not as many devices are free as it wants; so until its state changes. */
+void job_lacks_devices(struct job *job);
 
 /* The queued job that is due, not held, and fits, or NULL; it stays queued until job_set_state. */
 struct job *jobs_next(struct jobs *jobs, const struct job_filter *filter);
 /* queue_victim over the jobs' queue. */
-int jobs_victim(struct jobs *jobs, const enum priority *arriving, const struct queue_running *running, int count,
-		int idle);
+int jobs_victim(struct jobs *jobs, const struct queue_entry *arriving, const struct queue_running *running, int count,
+		int idle, int most);
 
 void job_set_plan(struct job *job, const struct recon_memory *memory, const char *plan);
 /* recon_hooks.denoising. Memory only, until the next change of state, as is the progress. */

@@ -118,6 +118,7 @@ static void job_ended(struct supervise *supervise, struct worker *worker, const 
 	worker->deadline = NEVER;
 	worker->state = WORKER_IDLE;
 	worker->signs.busy = false;
+	worker->failed_card = message->card;
 	worker_end_job(supervise, worker,
 		       &(struct worker_words){.end = worker_end_of(message->code),
 					      .code = message->code,

@@ -1,33 +1,61 @@
 /* Whether a job fits into the memory that the workers have: supervise.h. */
 #include <string.h>
 
+#include "core/cards/cards.h"
 #include "core/host_memory.h"
 #include "daemon/jobs/workers.h"
 
+int supervise_check_devices(const struct supervise *supervise, struct job_request *request, struct error *err)
+{
+	const int most = supervise->regular, standard = supervise->options.devices_per_job;
+
+	if (request->devices == 0)
+		request->devices = standard == DEVICES_ALL || standard < most ? standard : most;
+	if (request->devices > most && supervise->options.remote.program == NULL)
+		return error_set_at(err, ERR_IMPOSSIBLE, "/devices", "%d devices, and this host has %d",
+				    request->devices, most);
+	return 0;
+}
+
 /*
  * The memory that may come free until the job's turn; the worker looks again when it begins. A job that does not fit on
- * a card runs out of core, with its volumes in the host's memory.
+ * its cards runs out of core, with its volumes in the host's memory. Shares of the processor have one memory.
  */
-static size_t memory_available(const struct worker_facts *facts)
+static size_t memory_available(const struct worker_facts *facts, int devices)
 {
+	const bool shared = strcmp(facts->backend, "cpu") == 0;
+	const size_t bytes = facts->bytes_total * (size_t)(shared ? 1 : devices);
 	struct host_memory host;
 
 	host_memory(&host);
-	return strcmp(facts->backend, "cpu") == 0 || facts->bytes_total > host.total ? facts->bytes_total : host.total;
+	return shared || bytes > host.total ? bytes : host.total;
 }
 
 /*
  * The daemon has no CUDA to ask, so for a card it takes what no recipe can do
  * without: the projections as floats, the iterate and its copy.
  */
-static int memory_needed(const char *backend, const struct scan *scan, const struct recipe *recipe,
+static int memory_needed(const char *backend, int devices, const struct scan *scan, const struct recipe *recipe,
 			 struct recon_memory *ret_memory, struct error *err)
 {
+	const struct device_options options = {.threads = devices};
 	const struct backend *row = backend_find(backend);
 	const struct geometry *geometry = &scan->geometry;
 	const struct linearise linearise = scan_linearise(scan);
 	struct pixel_blocks blocks;
+	struct device *cards;
+	int code;
 
+	if (row != NULL && devices > 1) {
+		code = cards_open(row, NULL, devices, &options, &cards, err);
+		if (code != 0)
+			return code;
+		code = recon_memory(&backend_cards, cards, geometry, &linearise, recipe, ret_memory, err);
+		backend_cards.close(cards);
+		/* Where the job would not fit just now, it is counted as it would run out of core. */
+		ret_memory->total += code == 0 ? ret_memory->host : 0;
+		return code;
+	}
 	if (row != NULL)
 		return recon_memory(row, NULL, geometry, &linearise, recipe, ret_memory, err);
 	blocks = geometry_blocks(geometry, recipe->binning);
@@ -45,20 +73,23 @@ int supervise_check_memory(struct supervise *supervise, const struct scan *scan,
 	struct worker_facts facts[SLOTS_MAX];
 	struct recon_memory memory, best = {0};
 	size_t most = 0;
-	int count = supervise_workers(supervise, facts, SLOTS_MAX), code;
+	int count = supervise_workers(supervise, facts, SLOTS_MAX), devices = request->devices, code;
 	double bytes[WORKERS_MAX];
 
 	/* What other hosts have, they know alone. */
 	if (!where_fits(&request->where, supervise->options.remote.host, bytes, devices_memory(facts, count, bytes)))
 		count = 0;
 
+	if (devices == DEVICES_ALL || devices > supervise->regular)
+		devices = supervise->regular;
+	devices = devices > CARDS_MOST ? CARDS_MOST : devices > 1 ? devices : 1;
 	for (int i = 0; i < count; i++) {
 		if (facts[i].bytes_free == 0)
 			continue; /* has not said yet */
-		code = memory_needed(facts[i].backend, scan, recipe, &memory, err);
+		code = memory_needed(facts[i].backend, devices, scan, recipe, &memory, err);
 		if (code != 0)
 			return code;
-		memory.available = memory_available(&facts[i]);
+		memory.available = memory_available(&facts[i], devices);
 		if (memory.total <= memory.available) {
 			*ret_memory = memory;
 			return 0;
@@ -71,5 +102,5 @@ int supervise_check_memory(struct supervise *supervise, const struct scan *scan,
 	if (most > 0)
 		return error_set_at(err, ERR_IMPOSSIBLE, "/grid/size",
 				    "the job needs %zu bytes of memory, and %zu are available", best.total, most);
-	return memory_needed("cpu", scan, recipe, ret_memory, err);
+	return memory_needed("cpu", devices, scan, recipe, ret_memory, err);
 }

@@ -45,7 +45,7 @@ int jobs_offers(struct jobs *jobs, int skip, struct job_offer *ret_offers, int m
 			continue;
 		memcpy(ret_offers[count].id, job->id, sizeof(job->id));
 		memcpy(ret_offers[count].scan, job->scan, sizeof(job->scan));
-		ret_offers[count].where = job->request.where;
+		ret_offers[count].where = job_request_where(&job->request);
 		ret_offers[count].elsewhere = entry->elsewhere;
 		ret_offers[count++].priority = job->record.priority;
 	}
@@ -61,8 +61,9 @@ static void add_arriving(struct job *job, double since, struct job_offer *ret_of
 
 	pthread_mutex_lock(&job->jobs->lock);
 	may = may_go(job) && !job->record.cancel_asked;
-	*offer = (struct job_offer){
-	    .priority = job->record.priority, .where = job->request.where, .elsewhere = job->entry.elsewhere};
+	*offer = (struct job_offer){.priority = job->record.priority,
+				    .where = job_request_where(&job->request),
+				    .elsewhere = job->entry.elsewhere};
 	pthread_mutex_unlock(&job->jobs->lock);
 	/* Images of scatter go with the scan, before its projections. */
 	if (!may || !job_attendable(job, &facts) || facts.arrived <= since || facts.scatter.wanted > 0)
@@ -91,19 +92,21 @@ void job_place(struct job *job)
 	const struct jobs *jobs = job->jobs;
 	const struct where *where = &job->request.where;
 
-	job->entry.elsewhere = job->entry.choosy = false;
+	job->entry.elsewhere = jobs->devices_known && job->request.devices > jobs->devices_most;
+	job->entry.choosy = false;
 	if (where_is_any(where) || !jobs->devices_known)
 		return;
-	job->entry.elsewhere = !where_fits(where, jobs->host, jobs->device_bytes, jobs->devices);
+	job->entry.elsewhere |= !where_fits(where, jobs->host, jobs->device_bytes, jobs->devices);
 	for (int i = 0; i < jobs->devices; i++)
 		job->entry.choosy |= jobs->device_bytes[i] < where->memory;
 }
 
-void jobs_set_devices(struct jobs *jobs, const char *host, const double *memory, int count)
+void jobs_set_devices(struct jobs *jobs, const char *host, const double *memory, int count, int most)
 {
 	pthread_mutex_lock(&jobs->lock);
 	jobs->devices_known = true;
 	snprintf(jobs->host, sizeof(jobs->host), "%s", host);
+	jobs->devices_most = most;
 	jobs->devices = count < WHERE_DEVICES_MOST ? count : WHERE_DEVICES_MOST;
 	memcpy(jobs->device_bytes, memory, (size_t)jobs->devices * sizeof(*memory));
 	for (int i = 0; i < jobs->count; i++)

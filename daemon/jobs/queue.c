@@ -154,27 +154,34 @@ static const struct queue_entry *pushing(const struct queue_entry *entry)
 	return entry;
 }
 
-int queue_victim(const struct queue *queue, const enum priority *arriving, const struct queue_running *running,
-		 int count, int idle)
+static int wanted(const struct queue_entry *entry, int most)
+{
+	const int devices = entry->devices == DEVICES_ALL || entry->devices > most ? most : entry->devices;
+
+	return devices > 1 ? devices : 1;
+}
+
+int queue_victim(const struct queue *queue, const struct queue_entry *arriving, const struct queue_running *running,
+		 int count, int idle, int most)
 {
 	const struct queue_entry *entry = pushing(queue->first);
 	int coming = idle;
 
 	for (int i = 0; i < count; i++)
-		coming += running[i].leaving;
-	/* The first `coming` jobs get workers that are free already; the next one may push somebody out. */
+		coming += running[i].leaving ? (running[i].devices > 1 ? running[i].devices : 1) : 0;
+	/* The first jobs get the `coming` devices that are free already; the next one may push somebody out. */
 	while (entry != NULL || arriving != NULL) {
-		enum priority next;
+		const struct queue_entry *next = entry;
 
-		if (arriving != NULL && (entry == NULL || *arriving > entry->priority)) {
-			next = *arriving;
+		if (arriving != NULL && (entry == NULL || arriving->priority > entry->priority)) {
+			next = arriving;
 			arriving = NULL;
 		} else {
-			next = entry->priority;
 			entry = pushing(entry->next);
 		}
-		if (coming-- <= 0)
-			return least_of(running, count, next);
+		coming -= wanted(next, most);
+		if (coming < 0)
+			return least_of(running, count, next->priority);
 	}
 	return -1;
 }

@@ -27,6 +27,7 @@ struct queue_entry {
 	struct queue_client *client; /* never NULL */
 	enum priority priority;
 	long long ticket;
+	int devices; /* that it wants at once; DEVICES_ALL: all that there are; 0 as 1 */
 	bool queued;
 	bool held;      /* its time has not come: it keeps its place, others go before it */
 	bool elsewhere; /* it may have no device here: nobody waits for it, and it pushes nobody out */
@@ -57,18 +58,20 @@ struct queue_entry *queue_next(const struct queue *queue,
 struct queue_running {
 	enum priority priority;
 	long long ticket;
+	int devices;    /* that it has; 0 as 1 */
 	bool leaving;   /* asked to yield or to cancel: its worker is as good as free */
 	bool gives_way; /* to any other: it has nothing to do just now */
 };
 
 /*
  * Which of running[count] should yield so that a queued job of higher priority
- * gets a worker, when `idle` workers are free: one that gives way, else the lowest
+ * gets its devices, when `idle` ones are free: one that gives way, else the lowest
  * priority, and of those the one that came last. -1 when none should. `arriving`:
- * the priority of one more job that is not queued, but wants a worker like those
- * that are, behind all of its priority; NULL: there is none.
+ * priority and devices of one more job that is not queued, but wants a worker like
+ * those that are, behind all of its priority; NULL: there is none. `most`: devices
+ * that there are at all, which a job that wants more contents itself with.
  */
-int queue_victim(const struct queue *queue, const enum priority *arriving, const struct queue_running *running,
-		 int count, int idle);
+int queue_victim(const struct queue *queue, const struct queue_entry *arriving, const struct queue_running *running,
+		 int count, int idle, int most);
 
 #endif

@@ -26,10 +26,19 @@ struct client *jobs_client(struct jobs *jobs, const char *name)
 	return client;
 }
 
+static int devices_of(const struct job_record *record)
+{
+	int devices = 1;
+
+	for (const char *at = record->ran_on; *at != '\0'; at++)
+		devices += *at == ',';
+	return devices;
+}
+
 static void charge(struct job *job, double now)
 {
 	if (job->charged > 0)
-		job->client->share.used += now - job->charged;
+		job->client->share.used += (now - job->charged) * devices_of(&job->record);
 	job->charged = job->record.state == JOB_RUNNING ? now : 0;
 }
 

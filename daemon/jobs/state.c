@@ -102,6 +102,16 @@ static void enter_waiting(struct job_record *record, enum job_state from)
 	record->reconstructed = 0;
 }
 
+void job_note_devices(struct job_record *record, const struct job_change *change)
+{
+	if (change->backend != NULL)
+		snprintf(record->backend, sizeof(record->backend), "%s", change->backend);
+	if (change->device != NULL)
+		snprintf(record->device, sizeof(record->device), "%s", change->device);
+	if (change->ran_on != NULL)
+		snprintf(record->ran_on, sizeof(record->ran_on), "%s", change->ran_on);
+}
+
 static void enter_running(struct job_record *record, enum job_state from, const struct job_change *change,
 			  struct jobs *jobs)
 {
@@ -124,10 +134,7 @@ static void enter_running(struct job_record *record, enum job_state from, const 
 		record->stage = STAGE_LOAD;
 		record->reconstructed = 0;
 	}
-	if (change->backend != NULL)
-		snprintf(record->backend, sizeof(record->backend), "%s", change->backend);
-	if (change->device != NULL)
-		snprintf(record->device, sizeof(record->device), "%s", change->device);
+	job_note_devices(record, change);
 }
 
 /* directory: of the store; what lies in it is named without it. */
@@ -206,6 +213,7 @@ static void show_state(struct job *job, const struct job_record *record, const s
 	pthread_mutex_lock(&jobs->lock);
 	from = job->record.state;
 	job->record = *record;
+	job->lacks_devices = false;
 	jobs->running += (record->state == JOB_RUNNING) - (from == JOB_RUNNING);
 	queue_remove(&jobs->queue, &job->entry);
 	job_share(job);

@@ -29,7 +29,7 @@ static const double STEADY = 60;                            /* s of life after w
 static const double AWAY_LOOK = 0.1; /* s between two looks whether the catalogue is there again */
 static const double LOOK = 1;        /* s between two looks whether a job that is held may go on */
 
-const char *const worker_state_names[WORKER_STATE_COUNT] = {"absent", "starting", "idle", "busy", "ending"};
+const char *const worker_state_names[WORKER_STATE_COUNT] = {"absent", "starting", "idle", "busy", "ending", "lent"};
 
 void supervise_wake(void *context)
 {
@@ -65,8 +65,10 @@ void worker_publish(struct supervise *supervise, const struct worker *worker)
 	facts.aside_since = worker->aside_since;
 	facts.test_at = worker->state == WORKER_ABSENT ? worker->start_at : 0;
 	facts.restarts = worker->starts > 0 ? worker->starts - 1 : 0;
-	if (worker->job != NULL) {
-		job_facts(worker->job, &job);
+	if (worker->lent_to != NULL && worker->state == WORKER_IDLE)
+		facts.state = WORKER_LENT;
+	if (worker->job != NULL || (worker->lent_to != NULL && worker->lent_to->job != NULL)) {
+		job_facts(worker->job != NULL ? worker->job : worker->lent_to->job, &job);
 		memcpy(facts.job, job.id, sizeof(facts.job));
 	}
 	pthread_mutex_lock(&supervise->lock);
@@ -626,7 +628,7 @@ bool worker_answers(const struct worker_facts *facts)
 					     .stepped = facts->stepped,
 					     .step_seconds = facts->step_seconds};
 
-	return (facts->state == WORKER_IDLE || facts->state == WORKER_BUSY) &&
+	return (facts->state == WORKER_IDLE || facts->state == WORKER_LENT || facts->state == WORKER_BUSY) &&
 	       watchdog_answers(&signs, clock_monotonic());
 }
 

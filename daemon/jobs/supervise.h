@@ -42,6 +42,7 @@ struct supervise_options {
 	const char *worker;        /* path of cbct-worker; NULL: beside this program, else from PATH */
 	const char *backend;       /* "auto", "cuda", "cpu" */
 	int workers;               /* 0 = 1 */
+	int devices_per_job;       /* of jobs that do not say; DEVICES_ALL; 0 = 1 */
 	const int *devices;        /* [workers], the device of each; NULL: 0 .. workers - 1 */
 	int threads;               /* of the CPU backend; 0 = all */
 	size_t device_memory;      /* bytes a worker may use; 0 = what is free */
@@ -66,6 +67,12 @@ int supervise_probe(struct supervise *supervise, double seconds, struct error *e
 
 /* At least one worker is there that can take jobs (idle or busy), and answers. */
 bool supervise_ready(struct supervise *supervise);
+
+/*
+ * Devices of a job that leaves them open become the daemon's default, as far as this host has so many. ERR_IMPOSSIBLE,
+ * pointer "/devices": the job wants more than there are, and no other host may have them.
+ */
+int supervise_check_devices(const struct supervise *supervise, struct job_request *request, struct error *err);
 
 /*
  * Compares the memory that a job needs with that of the workers: ERR_IMPOSSIBLE with both
@@ -96,7 +103,15 @@ void supervise_set_places(struct supervise *supervise, const struct place *place
 int supervise_spent(struct supervise *supervise, struct place ret_places[PLACES_MAX]);
 
 /* A copy of what is known of one worker, for GET /v1/devices, /readyz and /metrics. */
-enum worker_state { WORKER_ABSENT, WORKER_STARTING, WORKER_IDLE, WORKER_BUSY, WORKER_ENDING, WORKER_STATE_COUNT };
+enum worker_state {
+	WORKER_ABSENT,
+	WORKER_STARTING,
+	WORKER_IDLE,
+	WORKER_BUSY,
+	WORKER_ENDING,
+	WORKER_LENT, /* idle, and another worker's job has its device; in worker_facts alone */
+	WORKER_STATE_COUNT
+};
 extern const char *const worker_state_names[WORKER_STATE_COUNT];
 struct worker_facts {
 	int index, device_index; /* the second counts devices of its backend */
@@ -104,7 +119,7 @@ struct worker_facts {
 	long pid; /* 0: none */
 	char backend[16], device[96], driver[64];
 	size_t bytes_total, bytes_free;
-	char job[ID_SIZE];    /* "" when there is none */
+	char job[ID_SIZE];    /* that has its device, "" when there is none */
 	double stepped;       /* monotonic: when it was last seen to have finished a step; 0: it does not work */
 	double heard;         /* monotonic: when something came from it */
 	double step_seconds;  /* that its step under way may take by its nature */

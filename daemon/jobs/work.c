@@ -12,7 +12,8 @@
 #include "proto/durable.h"
 #include "proto/json.h"
 
-const char *const job_obstacle_names[JOB_OBSTACLE_COUNT] = {"", "space", "disk", "memory", "host", "checkpoint"};
+const char *const job_obstacle_names[JOB_OBSTACLE_COUNT] = {"",     "space",      "disk",   "memory",
+							    "host", "checkpoint", "devices"};
 
 static int promote(struct jobs *jobs, struct job *job, struct error *err)
 {
@@ -126,7 +127,7 @@ struct job *jobs_arriving(struct jobs *jobs, double since, const struct job_filt
 	return best.job;
 }
 
-int job_attend(struct job *job, const char *backend, const char *device, struct error *err)
+int job_attend(struct job *job, const struct job_change *change, struct error *err)
 {
 	struct job_record *record = &job->record;
 	int code = 0;
@@ -139,8 +140,7 @@ int job_attend(struct job *job, const char *backend, const char *device, struct 
 	} else {
 		record->attended = true;
 		record->stage = STAGE_FDK;
-		snprintf(record->backend, sizeof(record->backend), "%s", backend);
-		snprintf(record->device, sizeof(record->device), "%s", device);
+		job_note_devices(record, change);
 	}
 	pthread_mutex_unlock(&job->jobs->lock);
 	pthread_mutex_unlock(&job->jobs->change);
@@ -238,6 +238,8 @@ enum job_obstacle job_obstacle(struct job *job)
 		obstacle = JOB_NO_HOST;
 	else if (job->request.resume > 0 && job->record.state == JOB_WAITING && job->record.checkpoint == 0)
 		obstacle = JOB_NO_CHECKPOINT;
+	else if (obstacle == JOB_UNHINDERED && job->lacks_devices)
+		obstacle = JOB_NO_DEVICES;
 	pthread_mutex_unlock(&job->jobs->lock);
 	return obstacle;
 }
@@ -256,6 +258,18 @@ bool jobs_want_processor(struct jobs *jobs)
 		want = jobs->all[i]->trial.processor && !job_state_ended(jobs->all[i]->record.state);
 	pthread_mutex_unlock(&jobs->lock);
 	return want;
+}
+
+void job_lacks_devices(struct job *job)
+{
+	bool news;
+
+	pthread_mutex_lock(&job->jobs->lock);
+	news = !job->lacks_devices && job->record.state == JOB_QUEUED;
+	job->lacks_devices |= news;
+	pthread_mutex_unlock(&job->jobs->lock);
+	if (news)
+		job_wake(job);
 }
 
 struct job *job_of_entry(const struct queue_entry *entry)
@@ -287,13 +301,13 @@ struct job *jobs_next(struct jobs *jobs, const struct job_filter *filter)
 	return job;
 }
 
-int jobs_victim(struct jobs *jobs, const enum priority *arriving, const struct queue_running *running, int count,
-		int idle)
+int jobs_victim(struct jobs *jobs, const struct queue_entry *arriving, const struct queue_running *running, int count,
+		int idle, int most)
 {
 	int victim;
 
 	pthread_mutex_lock(&jobs->lock);
-	victim = queue_victim(&jobs->queue, arriving, running, count, idle);
+	victim = queue_victim(&jobs->queue, arriving, running, count, idle, most);
 	pthread_mutex_unlock(&jobs->lock);
 	return victim;
 }

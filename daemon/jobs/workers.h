@@ -4,6 +4,7 @@
 #include <pthread.h>
 #include <stdatomic.h>
 
+#include "core/cards/cards.h"
 #include "core/host_memory.h"
 #include "daemon/jobs/digest.h"
 #include "daemon/jobs/outcome.h"
@@ -92,7 +93,11 @@ struct worker {
 	size_t steps;     /* that it has finished by its last sign of life */
 	char killed[128]; /* why the daemon ended the process: it ...; "" as long as it has not */
 
-	struct job *job; /* reference; NULL: none */
+	struct job *job;                  /* reference; NULL: none */
+	struct worker *cards[CARDS_MOST]; /* of the devices that its job has or had last, its own first: lend.c */
+	int card_count;
+	int failed_card;        /* place among them of the one that ended the job in an error */
+	struct worker *lent_to; /* another one's job has its device; NULL: none */
 	struct queue_running running;
 	int checkpoint;      /* that it began from */
 	size_t volume_bytes; /* of one volume of its job */
@@ -206,7 +211,33 @@ void devices_tend(struct supervise *supervise);
 /* The job begins on the processor though it was meant for another device: its document says so. */
 void device_tell_fallback(struct supervise *supervise, struct worker *worker, int iterations);
 /* JSON of how a job's last run was lost, for the document of a job that fails; owned by the caller. NULL: no memory. */
-char *device_report(const struct worker *worker, const struct worker_words *words, int runs);
+char *device_report(struct worker *worker, const struct worker_words *words, int runs);
+
+/* Set aside, or DEVICE_FAULTS processes in a row have ended without a hello, as without a driver. */
+bool device_is_out(const struct worker *worker);
+
+/* ---- lend.c ---- */
+/* It could begin a job now. */
+bool worker_is_free(const struct worker *worker);
+/* Devices of this host that are given jobs. */
+int devices_in_service(const struct supervise *supervise);
+/* The devices with which the job would begin on this worker, its own first; returns 0 where some of them are not free.
+ */
+int devices_choose(struct worker *worker, const struct job_trial *trial, struct worker *ret_cards[CARDS_MOST]);
+/* The worker's new job has them until devices_return finds that it has ended. */
+void devices_lend(struct supervise *supervise, struct worker *worker, struct worker *const cards[], int count);
+void devices_return(struct supervise *supervise);
+/* The one whose device failed, when the worker's job ended in a device's error: itself, or one that is lent to it. */
+struct worker *worker_failed_card(struct worker *worker);
+enum { CARDS_TEXT = 64 };
+struct device_names {
+	char device[96];         /* job_change.device */
+	char cards[CARDS_TEXT];  /* of MESSAGE_START */
+	char ran_on[CARDS_TEXT]; /* job_change.ran_on */
+};
+void devices_name(const struct worker *worker, struct worker *const cards[], int count, struct device_names *ret);
+/* The worker's job has fewer devices than it asks for: its document says so. */
+void devices_tell_fewer(struct worker *worker, const struct job_trial *trial, int count);
 
 /* ---- starve.c ---- */
 /* The worker's new process is there: which control group bounds its memory. */

@@ -411,7 +411,9 @@ struct job_record {
 	int crashes;  /* workers that died with it */
 	int checkpoint; /* iteration that checkpoint.f32 holds, 0: none */
 	unsigned basis; /* of its scan, when it ran last */
-	char backend[16], device[96], plan[160];
+	char backend[16], device[96], plan[320];
+	char ran_on[64]; /* numbers of the workers whose devices it has, or had last, "0,2"; "": none yet, or elsewhere
+			  */
 	struct recon_memory memory;
 	double noise_hu, tv_alpha;        /* recon_hooks.denoising; NaN before it was called */
 	struct recon_agreement agreement; /* recon_hooks.agreement; all 0 before it was called */

@@ -72,6 +72,7 @@ static const struct column job_columns[] = {
     {"backend", COLUMN_TEXT, AT(job_record, backend), .changes = true},
     {"device", COLUMN_TEXT, AT(job_record, device), .changes = true},
     {"plan", COLUMN_TEXT, AT(job_record, plan), .changes = true},
+    {"ran_on", COLUMN_TEXT, AT(job_record, ran_on), .initial = "", .changes = true},
 #define MEMORY(member)                                                                                                 \
 	{                                                                                                              \
 		"memory_" #member, COLUMN_LONG, AT(job_record, memory.member), .initial = "0", .changes = true         \

@@ -11,9 +11,9 @@
  *
  *   1 .. 10   tables and columns were added
  *   11        of jobs, `memory` and `seconds` were arrays of the processor's numbers; they are numbers with names now
- *   12 .. 21  tables and columns were added
+ *   12 .. 22  tables and columns were added
  */
-enum { CATALOGUE_VERSION = 22 };
+enum { CATALOGUE_VERSION = 23 };
 
 /* Brings an empty catalogue (version 0) or an older one to CATALOGUE_VERSION, in one transaction. */
 int catalogue_upgrade(const struct catalogue_backend *backend, void *database, int version, struct error *err);

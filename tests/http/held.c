@@ -9,9 +9,11 @@
  * CBCT_TEST_STUCK names: "http", "thread" (one of the server's, the first that is asked), "supervisor" or "catalogue".
  * A worker with CBCT_TEST_CARDS in its environment
  * pretends that the processor is a card, whose calls fail while the file that it names says so: "CALL DEVICES", where
- * CALL is "filter" or "iterate", which end in a device error, or "hang" and "kill", which do that at an iteration.
+ * CALL is "filter" or "iterate", which end in a device error, or "hang" and "kill", which do that at an iteration. A
+ * job on several of them has each as its own card.
  */
 #include <signal.h>
+#include <pthread.h>
 #include <stdatomic.h>
 #include <stdbool.h>
 #include <stdio.h>
@@ -88,29 +90,60 @@ struct backend;
 const struct backend *__real_backend_find(const char *name) __attribute__((weak));
 const struct backend *__wrap_backend_find(const char *name);
 
-/* The number behind --device. */
-static char device_of_process(void)
-{
-	static char arguments[4096];
-	FILE *file = fopen("/proc/self/cmdline", "re");
-	size_t length = file == NULL ? 0 : fread(arguments, 1, sizeof(arguments) - 1, file);
+/* Which card each device and each plan is of: the latest of them. */
+enum { KNOWN = 512 };
+static struct {
+	pthread_mutex_t lock;
+	int next;
+	const void *what[KNOWN];
+	int card[KNOWN];
+} known = {.lock = PTHREAD_MUTEX_INITIALIZER};
 
-	if (file != NULL)
-		fclose(file);
-	for (size_t i = 0; i + 10 < length; i += strlen(arguments + i) + 1) {
-		if (strcmp(arguments + i, "--device") == 0)
-			return arguments[i + strlen("--device") + 1];
-	}
-	return '?';
+static void note(const void *what, int card)
+{
+	pthread_mutex_lock(&known.lock);
+	known.what[known.next % KNOWN] = what;
+	known.card[known.next++ % KNOWN] = card;
+	pthread_mutex_unlock(&known.lock);
 }
 
-/* The file says that this call fails on this device. */
-static bool trouble(const char *call)
+static int card_of(const void *what)
+{
+	int card = -1;
+
+	pthread_mutex_lock(&known.lock);
+	for (int i = known.next - 1; i >= 0 && i >= known.next - KNOWN && card < 0; i--)
+		card = known.what[i % KNOWN] == what ? known.card[i % KNOWN] : -1;
+	pthread_mutex_unlock(&known.lock);
+	return card;
+}
+
+static int open_card(int index, const struct device_options *options, struct device **ret_device, struct error *err)
+{
+	int code = backend_cpu.open(0, options, ret_device, err);
+
+	if (code == 0)
+		note(*ret_device, index);
+	return code;
+}
+
+static int plan_on_card(struct device *device, const struct plan_options *options, struct plan **ret_plan,
+			struct error *err)
+{
+	int code = backend_cpu.plan_new(device, options, ret_plan, err);
+
+	if (code == 0)
+		note(*ret_plan, card_of(device));
+	return code;
+}
+
+/* The file says that this call fails on the card of this plan. */
+static bool trouble(const struct plan *plan, const char *call)
 {
 	FILE *file = fopen(getenv("CBCT_TEST_CARDS"), "re");
 	char wanted[32] = "", devices[64] = "";
 	bool found = file != NULL && fscanf(file, "%31s %63s", wanted, devices) == 2 && strcmp(wanted, call) == 0 &&
-		     strchr(devices, device_of_process()) != NULL;
+		     strchr(devices, '0' + card_of(plan)) != NULL;
 
 	if (file != NULL)
 		fclose(file);
@@ -120,9 +153,20 @@ static bool trouble(const char *call)
 static int filter_or_fail(struct plan *plan, const struct stack *from, const int *slots, const int *views, int count,
 			  struct stack *to, struct error *err)
 {
-	if (trouble("filter"))
+	if (trouble(plan, "filter"))
 		return error_set(err, ERR_DEVICE, "the card has fallen off the bus");
 	return backend_cpu.filter(plan, from, slots, views, count, to, err);
+}
+
+static int fail_iterating(const struct plan *plan, struct error *err)
+{
+	if (trouble(plan, "iterate"))
+		return error_set(err, ERR_DEVICE, "the card has counted an error that it cannot correct");
+	if (trouble(plan, "kill"))
+		raise(SIGKILL);
+	while (trouble(plan, "hang"))
+		nanosleep(&(struct timespec){.tv_nsec = 10000000}, NULL);
+	return 0;
 }
 
 static int iterate_or_fail(struct plan *plan, const struct stack *projections, struct volume *volume,
@@ -130,13 +174,18 @@ static int iterate_or_fail(struct plan *plan, const struct stack *projections, s
 {
 	int code = backend_cpu.sart_iterate(plan, projections, volume, cancel, ret_sums, err);
 
-	if (code == 0 && trouble("iterate"))
-		code = error_set(err, ERR_DEVICE, "the card has counted an error that it cannot correct");
-	if (code == 0 && trouble("kill"))
-		raise(SIGKILL);
-	while (code == 0 && trouble("hang"))
-		nanosleep(&(struct timespec){.tv_nsec = 10000000}, NULL);
-	return code;
+	return code == 0 ? fail_iterating(plan, err) : code;
+}
+
+/* The same of one card of several. */
+static int correct_or_fail(struct plan *plan, const struct geometry *geometry, const struct grid *grid,
+			   const struct stack *projections, const int *slots, const int *views, int count,
+			   struct stack *rays, struct iteration_sums *ret_sums, struct error *err)
+{
+	int code =
+	    backend_cpu.sart_correct(plan, geometry, grid, projections, slots, views, count, rays, ret_sums, err);
+
+	return code == 0 ? fail_iterating(plan, err) : code;
 }
 
 const struct backend *__wrap_backend_find(const char *name)
@@ -147,8 +196,12 @@ const struct backend *__wrap_backend_find(const char *name)
 		return __real_backend_find(name);
 	card = backend_cpu;
 	card.name = "cuda";
+	card.own_memory = true;
+	card.open = open_card;
+	card.plan_new = plan_on_card;
 	card.filter = filter_or_fail;
 	card.sart_iterate = iterate_or_fail;
+	card.sart_correct = correct_or_fail;
 	return &card;
 }
 

@@ -27,6 +27,8 @@ static void set_up(void)
 	state_put(&state, scan, 0, 3, 1);
 }
 
+static const struct job_change on_some = {.backend = "cpu", .device = "some", .ran_on = "0"};
+
 static void tear_down(void)
 {
 	stored_scan_release(scan);
@@ -135,7 +137,7 @@ START_TEST(a_waiting_job_is_attended_and_runs_with_its_last_projection)
 	ck_assert_ptr_eq(found, job); /* also before anything has come */
 	ck_assert(!arriving);
 	job_release(found);
-	ck_assert_int_eq(job_attend(job, "cpu", "some", &err), 0);
+	ck_assert_int_eq(job_attend(job, &on_some, &err), 0);
 	ck_assert_ptr_null(jobs_arriving(state.jobs, 0, NULL, &arriving));
 	job_reconstructed(job, 2);
 	/* its scan is ready, but it is in a worker's hands */
@@ -148,14 +150,14 @@ START_TEST(a_waiting_job_is_attended_and_runs_with_its_last_projection)
 	state_set(job, JOB_WAITING, &died);
 	job_record(job, &record);
 	ck_assert(!record.attended && record.reconstructed == 0 && record.attempts == 2 && record.crashes == 1);
-	ck_assert_int_eq(job_attend(job, "cpu", "some", &err), 0);
+	ck_assert_int_eq(job_attend(job, &on_some, &err), 0);
 	ck_assert_int_eq(job_leave(job, &err), 0);
 	ck_assert_int_eq(state_of(job), JOB_WAITING);
-	ck_assert_int_eq(job_attend(job, "cpu", "some", &err), 0);
+	ck_assert_int_eq(job_attend(job, &on_some, &err), 0);
 	state_set(job, JOB_RUNNING, NULL);
 	job_record(job, &record);
 	ck_assert(!record.attended && record.attempts == 2 && record.ticket > 0 && record.queued > 0);
-	ck_assert_int_eq(job_attend(job, "cpu", "some", &err), ERR_CONFLICT);
+	ck_assert_int_eq(job_attend(job, &on_some, &err), ERR_CONFLICT);
 	job_release(job);
 	stored_scan_release(growing);
 }
@@ -226,7 +228,7 @@ START_TEST(a_cancel_of_an_attended_job_waits_for_its_worker_or_a_restart)
 		struct job *job = state_post(&state, growing, "routine");
 
 		keep_id(job, id);
-		ck_assert_int_eq(job_attend(job, "cpu", "some", &err), 0);
+		ck_assert_int_eq(job_attend(job, &on_some, &err), 0);
 		ck_assert_int_eq(jobs_delete(state.jobs, job, &removed, &err), 0);
 		ck_assert(!removed);
 		ck_assert_int_eq(state_of(job), JOB_WAITING);

@@ -56,15 +56,15 @@ START_TEST(the_lowest_and_latest_makes_room_for_the_higher)
 		const char *why;
 		int arriving; /* priority + 1 of one that is not queued, 0: none */
 	} cases[] = {
-	    {{PRIORITY_STAT}, 0, {{PRIORITY_ROUTINE, 1, false, false}}, 1, 0, -1, "an empty queue", 0},
-	    {{PRIORITY_ROUTINE}, 1, {{PRIORITY_ROUTINE, 1, false, false}}, 1, 0, -1, "an equal waits", 0},
-	    {{PRIORITY_URGENT}, 1, {{PRIORITY_STAT, 1, false, false}}, 1, 0, -1, "a lower one waits", 0},
-	    {{PRIORITY_URGENT}, 1, {{PRIORITY_ROUTINE, 1, false, false}}, 1, 0, 0, "a higher one pushes", 0},
-	    {{PRIORITY_STAT}, 1, {{PRIORITY_ROUTINE, 1, false, false}}, 1, 1, -1, "a worker is idle", 0},
-	    {{PRIORITY_STAT}, 1, {{PRIORITY_ROUTINE, 1, true, false}}, 1, 0, -1, "room is being made", 0},
+	    {{PRIORITY_STAT}, 0, {{PRIORITY_ROUTINE, 1, 1, false, false}}, 1, 0, -1, "an empty queue", 0},
+	    {{PRIORITY_ROUTINE}, 1, {{PRIORITY_ROUTINE, 1, 1, false, false}}, 1, 0, -1, "an equal waits", 0},
+	    {{PRIORITY_URGENT}, 1, {{PRIORITY_STAT, 1, 1, false, false}}, 1, 0, -1, "a lower one waits", 0},
+	    {{PRIORITY_URGENT}, 1, {{PRIORITY_ROUTINE, 1, 1, false, false}}, 1, 0, 0, "a higher one pushes", 0},
+	    {{PRIORITY_STAT}, 1, {{PRIORITY_ROUTINE, 1, 1, false, false}}, 1, 1, -1, "a worker is idle", 0},
+	    {{PRIORITY_STAT}, 1, {{PRIORITY_ROUTINE, 1, 1, true, false}}, 1, 0, -1, "room is being made", 0},
 	    {{PRIORITY_STAT, PRIORITY_STAT},
 	     2,
-	     {{PRIORITY_ROUTINE, 1, true, false}, {PRIORITY_URGENT, 2, false, false}},
+	     {{PRIORITY_ROUTINE, 1, 1, true, false}, {PRIORITY_URGENT, 2, 1, false, false}},
 	     2,
 	     0,
 	     1,
@@ -72,9 +72,9 @@ START_TEST(the_lowest_and_latest_makes_room_for_the_higher)
 	     0},
 	    {{PRIORITY_STAT},
 	     1,
-	     {{PRIORITY_URGENT, 1, false, false},
-	      {PRIORITY_ROUTINE, 2, false, false},
-	      {PRIORITY_ROUTINE, 3, false, false}},
+	     {{PRIORITY_URGENT, 1, 1, false, false},
+	      {PRIORITY_ROUTINE, 2, 1, false, false},
+	      {PRIORITY_ROUTINE, 3, 1, false, false}},
 	     3,
 	     0,
 	     2,
@@ -82,7 +82,7 @@ START_TEST(the_lowest_and_latest_makes_room_for_the_higher)
 	     0},
 	    {{PRIORITY_STAT, PRIORITY_URGENT},
 	     2,
-	     {{PRIORITY_URGENT, 1, true, false}, {PRIORITY_URGENT, 2, false, false}},
+	     {{PRIORITY_URGENT, 1, 1, true, false}, {PRIORITY_URGENT, 2, 1, false, false}},
 	     2,
 	     0,
 	     -1,
@@ -90,7 +90,7 @@ START_TEST(the_lowest_and_latest_makes_room_for_the_higher)
 	     0},
 	    {{PRIORITY_ROUTINE},
 	     1,
-	     {{PRIORITY_STAT, 1, false, true}},
+	     {{PRIORITY_STAT, 1, 1, false, true}},
 	     1,
 	     0,
 	     0,
@@ -98,25 +98,32 @@ START_TEST(the_lowest_and_latest_makes_room_for_the_higher)
 	     0},
 	    {{PRIORITY_STAT},
 	     1,
-	     {{PRIORITY_ROUTINE, 1, false, false}, {PRIORITY_STAT, 2, false, true}},
+	     {{PRIORITY_ROUTINE, 1, 1, false, false}, {PRIORITY_STAT, 2, 1, false, true}},
 	     2,
 	     0,
 	     1,
 	     "and before all",
 	     0},
-	    {{PRIORITY_STAT}, 0, {{PRIORITY_STAT, 1, false, true}}, 1, 0, -1, "but not for nobody", 0},
+	    {{PRIORITY_STAT}, 0, {{PRIORITY_STAT, 1, 1, false, true}}, 1, 0, -1, "but not for nobody", 0},
 	    {{PRIORITY_STAT},
 	     0,
-	     {{PRIORITY_ROUTINE, 1, false, false}},
+	     {{PRIORITY_ROUTINE, 1, 1, false, false}},
 	     1,
 	     0,
 	     0,
 	     "one that arrives pushes a lower one",
 	     1 + PRIORITY_URGENT},
-	    {{PRIORITY_STAT}, 0, {{PRIORITY_URGENT, 1, false, false}}, 1, 0, -1, "and no equal", 1 + PRIORITY_URGENT},
+	    {{PRIORITY_STAT},
+	     0,
+	     {{PRIORITY_URGENT, 1, 1, false, false}},
+	     1,
+	     0,
+	     -1,
+	     "and no equal",
+	     1 + PRIORITY_URGENT},
 	    {{PRIORITY_URGENT},
 	     1,
-	     {{PRIORITY_ROUTINE, 1, false, false}},
+	     {{PRIORITY_ROUTINE, 1, 1, false, false}},
 	     1,
 	     1,
 	     0,
@@ -124,7 +131,7 @@ START_TEST(the_lowest_and_latest_makes_room_for_the_higher)
 	     1 + PRIORITY_URGENT},
 	    {{PRIORITY_ROUTINE},
 	     1,
-	     {{PRIORITY_ROUTINE, 1, false, false}},
+	     {{PRIORITY_ROUTINE, 1, 1, false, false}},
 	     1,
 	     1,
 	     -1,
@@ -135,16 +142,16 @@ START_TEST(the_lowest_and_latest_makes_room_for_the_higher)
 	for (size_t i = 0; i < sizeof(cases) / sizeof(cases[0]); i++) {
 		struct queue queue = {0};
 		struct queue_entry entries[3] = {0};
-		enum priority arriving;
+		struct queue_entry arriving;
 
 		for (int k = 0; k < cases[i].queued_count; k++) {
 			entries[k].priority = (enum priority)cases[i].queued[k];
 			entries[k].ticket = 100 + k;
 			queue_add(&queue, &entries[k]);
 		}
-		arriving = (enum priority)(cases[i].arriving - 1);
+		arriving = (struct queue_entry){.priority = (enum priority)(cases[i].arriving - 1)};
 		ck_assert_msg(queue_victim(&queue, cases[i].arriving > 0 ? &arriving : NULL, cases[i].running,
-					   cases[i].running_count, cases[i].idle) == cases[i].victim,
+					   cases[i].running_count, cases[i].idle, 4) == cases[i].victim,
 			      "%s", cases[i].why);
 	}
 }
@@ -207,9 +214,9 @@ START_TEST(what_may_not_run_here_pushes_nobody_out_and_is_waited_for_by_nobody)
 
 	for (int i = 0; i < 3; i++)
 		queue_add(&queue, &entries[i]);
-	ck_assert_int_eq(queue_victim(&queue, NULL, &running, 1, 0), 0);
+	ck_assert_int_eq(queue_victim(&queue, NULL, &running, 1, 0, 1), 0);
 	entries[0].elsewhere = entries[1].elsewhere = true;
-	ck_assert_int_eq(queue_victim(&queue, NULL, &running, 1, 0), -1);
+	ck_assert_int_eq(queue_victim(&queue, NULL, &running, 1, 0, 1), -1);
 	ck_assert_int_eq(queue_position(&queue, &entries[2]), 1);
 	/* Among themselves, and for whoever has a host for them, they are in order. */
 	ck_assert_int_eq(queue_position(&queue, &entries[0]), 1);
@@ -217,10 +224,42 @@ START_TEST(what_may_not_run_here_pushes_nobody_out_and_is_waited_for_by_nobody)
 	/* The device that a push sets free may be one that it may not have. */
 	entries[0].elsewhere = false;
 	entries[0].choosy = true;
-	ck_assert_int_eq(queue_victim(&queue, NULL, &running, 1, 0), -1);
+	ck_assert_int_eq(queue_victim(&queue, NULL, &running, 1, 0, 1), -1);
 	ck_assert_int_eq(queue_position(&queue, &entries[2]), 2);
 	entries[1].elsewhere = false;
-	ck_assert_int_eq(queue_victim(&queue, NULL, &running, 1, 0), 0);
+	ck_assert_int_eq(queue_victim(&queue, NULL, &running, 1, 0, 1), 0);
+}
+END_TEST
+
+/* Jobs on several devices: who wants four pushes out until four are there, who has four sets four free. */
+START_TEST(room_is_counted_in_devices)
+{
+	struct queue_client client = {0};
+	struct queue_entry wide = {.client = &client, .priority = PRIORITY_STAT, .ticket = 9, .devices = 4};
+	struct queue_running running[] = {{.priority = PRIORITY_ROUTINE, .ticket = 1},
+					  {.priority = PRIORITY_ROUTINE, .ticket = 2, .devices = 1},
+					  {.priority = PRIORITY_STAT, .ticket = 3}};
+	struct queue queue = {0};
+
+	queue_add(&queue, &wide);
+	/* Of four devices one is free, one has an equal's job: two make room, and the rest is waited for. */
+	ck_assert_int_eq(queue_victim(&queue, NULL, running, 3, 1, 4), 1);
+	running[1].leaving = true;
+	ck_assert_int_eq(queue_victim(&queue, NULL, running, 3, 1, 4), 0);
+	running[0].leaving = true;
+	ck_assert_int_eq(queue_victim(&queue, NULL, running, 3, 1, 4), -1);
+	/* Where there are three in service, it has what it can get. */
+	running[0].leaving = false;
+	ck_assert_int_eq(queue_victim(&queue, NULL, running, 2, 1, 2), -1);
+	ck_assert_int_eq(queue_victim(&queue, NULL, running, 2, 1, 3), 0);
+	wide.devices = DEVICES_ALL;
+	ck_assert_int_eq(queue_victim(&queue, NULL, running, 2, 1, 2), -1);
+	ck_assert_int_eq(queue_victim(&queue, NULL, running, 2, 1, 3), 0);
+	/* One job that leaves four devices is enough. */
+	running[1].devices = 4;
+	ck_assert_int_eq(queue_victim(&queue, NULL, running, 2, 0, 4), -1);
+	running[1].leaving = false;
+	ck_assert_int_eq(queue_victim(&queue, NULL, running, 2, 0, 4), 1);
 }
 END_TEST
 
@@ -316,6 +355,7 @@ Suite *queue_suite(void)
 	tcase_add_test(tests, higher_priority_goes_first_and_equals_in_their_order);
 	tcase_add_test(tests, the_client_goes_first_that_has_used_the_least);
 	tcase_add_test(tests, what_may_not_run_here_pushes_nobody_out_and_is_waited_for_by_nobody);
+	tcase_add_test(tests, room_is_counted_in_devices);
 	tcase_add_test(tests, nobody_saves_time_up);
 	tcase_add_test(tests, long_and_short_jobs_share_the_time);
 	tcase_add_test(tests, the_lowest_and_latest_makes_room_for_the_higher);

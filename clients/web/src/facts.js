@@ -63,7 +63,7 @@ export function jobFacts(job) {
 		[t('Alpha found'), job.tv?.alpha === 'auto' && job.denoising ? (job.denoising.alpha === null ? t('nothing to smooth') : number(job.denoising.alpha)) : null],
 		[t('Geometry fits to'), job.geometry_agreement ? t('{mm} mm at the isocentre (one projection: ± {sigma} mm), {share} % of the detail elsewhere', { mm: number(job.geometry_agreement.mm, 2), sigma: number(job.geometry_agreement.sigma_mm, 2), share: Math.round(100 * job.geometry_agreement.unexplained) }) : null],
 		[t('Ended after'), job.stopped ? t('{n} iterations: {why}', { n: job.stopped.iteration, why: job.stopped.reason }) : null],
-		[t('Runs on'), job.device ? `${job.device} (${job.backend})` : job.backend],
+		[t('Runs on'), job.ran_on?.length > 1 ? t('{device} ({backend}), devices {list}', { device: job.device, backend: job.backend, list: job.ran_on.join(', ') }) : job.device ? `${job.device} (${job.backend})` : job.backend],
 		[t('Memory'), job.memory ? bytes(job.memory.total) : null],
 		[t('Asked for'), timeElement(job.created)],
 		[t('Ended'), job.ended ? timeElement(job.ended) : null],

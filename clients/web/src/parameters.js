@@ -54,7 +54,7 @@ export const groups = [
 	{ title: 'Job', pointer: '', fields: [
 		text('/emit', 'Keep volumes', { hint: 'fdk, fdk-tv, iterations', empty: 'the last one only', wide: true, read: value => value.split(/[\s,]+/).filter(Boolean).map(name => /^\d+$/.test(name) ? Number(name) : name),
 			write: list => (list ?? []).join(', ') }),
-		choice('/priority', 'Priority', ['routine', 'urgent', 'stat']), choice('/precision', 'Precision', ['standard', 'reference']),
+		choice('/priority', 'Priority', ['routine', 'urgent', 'stat']), text('/devices', 'Devices', { hint: 'or all', word: 'all', read: numberOrText }), choice('/precision', 'Precision', ['standard', 'reference']),
 		choice('/projector', 'Projector', ['interpolating', 'matched']), text('/binning', 'Binning, pixels', { hint: 'or auto', word: 'auto', read: numberOrText }), flag('/rings', 'Mend pixels that make rings'), flag('/hold_out', 'Hold one projection of twenty out'), number('/mu_water', 'Water, 1/mm'),
 	] },
 ]

@@ -19,7 +19,7 @@ export function badge(state) {
 /* What a job may wait for beside projections and its turn, in words. */
 const obstacles = () => ({ flat: t('the flat image'), dark: t('the dark image'), defects: t('the map of defects'), scatter: t('the images of its scatter'), check: t('the check of its files'),
 	space: t('room on the disk'), disk: t('the disk, which failed to read or write'),
-	memory: t('memory, of which there was not enough'), host: t('a host that may run it'),
+	memory: t('memory, of which there was not enough'), host: t('a host that may run it'), devices: t('as many free devices as it wants'),
 	checkpoint: t('the checkpoint that it goes on from') })
 
 /* The program says when its iterations end. */
