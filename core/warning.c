@@ -107,12 +107,13 @@ const struct warning_kind warning_kinds[] = {
     {"defects", SEVERITY_CAUTION, "Some samples could not be used and were replaced from their neighbours."},
     {"blank_views", SEVERITY_CAUTION, "Some projections are empty or show nothing, and were left out."},
     {"dark_parts", SEVERITY_CAUTION,
-     "Some projections are dark in a part of the detector, and were left out where that was possible."},
+     "Some projections lack a part of the detector or show it with another signal; it was taken from other "
+     "projections, or they were left out, where that was possible."},
     {"frozen_views", SEVERITY_CAUTION,
      "Some projections are copies of the ones before them, and were left out where that was possible."},
     {"dose_steps", SEVERITY_CAUTION,
-     "Some projections were taken with another dose than those beside them, and were left out where that was "
-     "possible."},
+     "Some projections were taken with another dose than those beside them, and were corrected or left out where that "
+     "was possible."},
     {"shifted_views", SEVERITY_SERIOUS,
      "Some projections lie aside of the others, as when the patient or the arm moves; they were left out where that "
      "was "

@@ -100,7 +100,12 @@ int input_open(struct input *ret_input, const struct linearise *linearise, const
 		input.content = calloc((size_t)geometry->count, sizeof(*input.content));
 		input.profiles = calloc((size_t)geometry->count, sizeof(*input.profiles));
 		input.outliers = calloc((size_t)geometry->count, sizeof(*input.outliers));
-		if (input.blank == NULL || input.content == NULL || input.profiles == NULL || input.outliers == NULL)
+		input.steps = calloc((size_t)geometry->count, sizeof(*input.steps));
+		input.mended = calloc((size_t)geometry->count, sizeof(*input.mended));
+		input.defects = calloc((size_t)geometry->count, sizeof(*input.defects));
+		input.edges = calloc((size_t)geometry->count, sizeof(*input.edges));
+		if (input.blank == NULL || input.content == NULL || input.profiles == NULL || input.outliers == NULL ||
+		    input.steps == NULL || input.mended == NULL || input.defects == NULL || input.edges == NULL)
 			code = error_set(err, ERR_NO_MEMORY, "no memory for a list of %d views", geometry->count);
 	}
 	if (code < 0)
@@ -129,6 +134,10 @@ void input_clear(struct input *input)
 	free(input->content);
 	free(input->profiles);
 	free(input->outliers);
+	free(input->steps);
+	free(input->mended);
+	free(input->defects);
+	free(input->edges);
 	for (int i = 0; i < input->copy_count; i++)
 		free(input->copies[i].slot);
 	*input = (struct input){0};
@@ -241,10 +250,10 @@ static bool row_reaches(const struct input *input, const void *samples, size_t f
 
 /* Notes the level of air at the ends of the rows, where no air region makes up for it. */
 static int look_at_air(struct input *input, const void *samples, int columns, int rows, float largest,
-		       struct error *err)
+		       struct view_edges *edges, struct error *err)
 {
 	const int edge = truncation_edge(columns), wide = 4 * edge, looked_at = rows < 64 ? rows : 64;
-	float *ends, air;
+	float *ends;
 
 	if (input->linearise.has_air_region || columns < wide)
 		return 0;
@@ -259,19 +268,15 @@ static int look_at_air(struct input *input, const void *samples, int columns, in
 			ends[i * wide + c] =
 			    line_integral(input, samples, (size_t)row * (size_t)columns + (size_t)column);
 		}
-	air = air_level(ends, wide, looked_at, edge, largest);
+	edges->air = air_level(ends, wide, looked_at, edge, largest);
+	edges->far_off = edges->air != 0 && edges->air >= truncation_level(largest);
 	free(ends);
-	if (air == 0)
-		return 0;
-	input->air_least = input->off == 0 ? air : fminf(input->air_least, air);
-	input->air_most = input->off == 0 ? air : fmaxf(input->air_most, air);
-	input->off++;
-	input->far_off += air >= truncation_level(largest);
 	return 0;
 }
 
 /* Notes whether the object extends beyond the first and the last row, and the level of air beside it. */
-static int look_at_ends(struct input *input, const void *samples, int columns, int rows, struct error *err)
+static int look_at_ends(struct input *input, const void *samples, int columns, int rows, struct view_edges *edges,
+			struct error *err)
 {
 	float largest = 0, level;
 
@@ -279,10 +284,38 @@ static int look_at_ends(struct input *input, const void *samples, int columns, i
 		largest = fmaxf(largest, line_integral(input, samples, i)); /* NAN is never the larger */
 	level = truncation_level(largest);
 	for (int end = 0; end < 2; end++)
-		input->ends[end] +=
+		edges->ends[end] =
 		    row_reaches(input, samples, end ? (size_t)(rows - 1) * (size_t)columns : 0, columns, level);
-	input->views_looked_at++;
-	return look_at_air(input, samples, columns, rows, largest, err);
+	edges->looked_at = true;
+	return look_at_air(input, samples, columns, rows, largest, edges, err);
+}
+
+static bool is_mended(const struct input *input, int view)
+{
+	for (int i = 0; i < input->mended_count; i++)
+		if (input->mended[i] == view)
+			return true;
+	return false;
+}
+
+/* Adds up what was seen at the edges of the views that are taken as they are. */
+static void add_edges(struct input *input, int views)
+{
+	for (int view = 0; view < views; view++) {
+		const struct view_edges *edges = &input->edges[view];
+
+		if (!edges->looked_at || is_mended(input, view))
+			continue;
+		input->views_looked_at++;
+		for (int end = 0; end < 2; end++)
+			input->ends[end] += edges->ends[end];
+		if (edges->air == 0)
+			continue;
+		input->air_least = input->off == 0 ? edges->air : fminf(input->air_least, edges->air);
+		input->air_most = input->off == 0 ? edges->air : fmaxf(input->air_most, edges->air);
+		input->off++;
+		input->far_off += edges->far_off;
+	}
 }
 
 static void add_counts(struct defect_counts *counts, const struct defect_counts *view)
@@ -351,6 +384,7 @@ int input_take(struct input *input, const struct backend *backend, struct plan *
 	if (code < 0)
 		return code;
 	add_counts(&input->counts, &counts);
+	input->defects[view] = counts;
 	if (counts.blank > 0)
 		input->blank[before.blank] = view;
 	input->log_air = counts.air_most > 0 ? logf(counts.air_most) : 0;
@@ -363,7 +397,7 @@ int input_take(struct input *input, const struct backend *backend, struct plan *
 		code = look_at_all(input, samples, columns, rows, &input->content[view], err);
 	}
 	if (code == 0 && view % input->look_every == 0)
-		code = look_at_ends(input, samples, columns, rows, err);
+		code = look_at_ends(input, samples, columns, rows, &input->edges[view], err);
 	if (code < 0)
 		return code;
 	input->views++;
@@ -422,17 +456,80 @@ const float *input_copy_of(const struct input *input, int view)
 	return NULL;
 }
 
-/* Adds the outliers that can be left out to the blank views; returns how many. `skip`: views that are none. */
+/* A view between two steps, as an outlier. */
+static struct outlier outlier_of(const struct step *step)
+{
+	const int blocks = (step->end[0] - step->first[0]) * (step->end[1] - step->first[1]);
+
+	if (step->kind == STEP_PART)
+		return (struct outlier){OUTLIER_DARK, (float)blocks / (CONTENT_BLOCKS * CONTENT_BLOCKS)};
+	return (struct outlier){step->kind == STEP_LEVEL ? OUTLIER_LEVEL : OUTLIER_NONE, step->level};
+}
+
+/* Line integrals behind a hardening polynomial are not another dose's by an offset. */
+static bool can_mend(const struct input *input, int view, bool keeps_all)
+{
+	if (input->steps[view].kind == STEP_LEVEL)
+		return input->linearise.hardening_count == 0 && (keeps_all || input_copy_of(input, view) != NULL);
+	return keeps_all;
+}
+
+/* The views between two steps. `skip`: views that are none of them; these are marked as well. */
+static int add_steps(struct input *input, bool *skip, const struct orbit *orbit, bool keeps_all, struct error *err)
+{
+	int code = steps_find(input->profiles, skip, orbit, input->steps, err);
+
+	for (int view = 0; view < orbit->count && code > 0; view++) {
+		struct step *step = &input->steps[view];
+		float level;
+
+		if (step->kind == STEP_NONE)
+			continue;
+		skip[view] = true;
+		if (step->kind == STEP_LEVEL && steps_air(input->profiles, step, view, &level))
+			step->level = level;
+		if (!can_mend(input, view, keeps_all))
+			continue;
+		input->mended[input->mended_count++] = view;
+		if (step->kind == STEP_LEVEL)
+			input->content[view].mean -= step->level;
+	}
+	return code < 0 ? code : 0;
+}
+
+/* What a view that is left out or mended had no counts in is told as a part that is dark, and as nothing else. */
+static void forget_defects(struct input *input, int view)
+{
+	struct defect_counts *all = &input->counts;
+	const struct defect_counts *own = &input->defects[view];
+
+	input->defective_views -= own->not_finite + own->saturated + own->zero > 0;
+	all->not_finite -= own->not_finite;
+	all->saturated -= own->saturated;
+	all->zero -= own->zero;
+}
+
+/*
+ * Adds the outliers that can be left out to the blank views, but those that are mended; returns how many. `skip`: views
+ * that are none, or lie between two steps.
+ */
 static int add_outliers(struct input *input, const bool *skip, const struct orbit *orbit, bool keeps_all,
 			struct error *err)
 {
 	const int before = input->left_out;
 	int code = outliers_find(input->profiles, skip, orbit, input->outliers, err);
 
-	for (int view = 0; view < orbit->count && code > 0; view++) {
-		if (input->outliers[view].kind == OUTLIER_NONE)
+	for (int view = 0; view < orbit->count && code >= 0; view++) {
+		const bool mended = is_mended(input, view);
+
+		if (input->steps[view].kind != STEP_NONE)
+			input->outliers[view] = outlier_of(&input->steps[view]);
+		if (input->outliers[view].kind == OUTLIER_NONE ||
+		    (!mended && !keeps_all && input_copy_of(input, view) == NULL))
 			continue;
-		if (!keeps_all && input_copy_of(input, view) == NULL)
+		if (input->outliers[view].kind == OUTLIER_DARK)
+			forget_defects(input, view);
+		if (mended)
 			continue;
 		add_blank(input, view);
 		input->left_out++;
@@ -468,10 +565,51 @@ int input_settle(struct input *input, const struct orbit *orbit, bool keeps_all,
 		blank[view] = blank[view] || empty[view];
 	}
 	if (code >= 0)
+		code = add_steps(input, blank, orbit, keeps_all, err);
+	if (code >= 0)
 		code = add_outliers(input, blank, orbit, keeps_all, err);
+	add_edges(input, orbit->count);
 	free(blank);
 	free(empty);
 	return code < 0 ? code : found + code;
+}
+
+/* Takes a level off the copy of a view. */
+static void take_off_copy(struct input *input, int view, float level)
+{
+	for (int i = 0; i < input->copy_count; i++)
+		for (size_t at = 0; input->copies[i].view == view && at < input->pixels; at++)
+			input->copies[i].slot[at] -= level;
+}
+
+int input_mend(struct input *input, const struct backend *backend, struct stack *projections,
+	       const struct geometry *geometry, const struct orbit *orbit, bool keeps_all, const struct cancel *cancel,
+	       struct error *err)
+{
+	bool *bad = blank_flags(input, orbit->count);
+	const struct mend_tools tools = {backend, projections, geometry, orbit, bad, cancel};
+	int *parts = malloc(sizeof(*parts) * ((size_t)input->mended_count + 1)), count = 0, code = 0;
+
+	if (bad == NULL || parts == NULL)
+		code = error_set(err, ERR_NO_MEMORY, "no memory for a list of %d views", orbit->count);
+	for (int i = 0; i < input->mended_count && code == 0; i++) {
+		const int view = input->mended[i];
+		const struct step *step = &input->steps[view];
+
+		if (step->kind == STEP_PART) {
+			bad[view] = true;
+			parts[count++] = view;
+		} else if (keeps_all) {
+			code = mend_level(&tools, view, step->level, err);
+		} else {
+			take_off_copy(input, view, step->level);
+		}
+	}
+	if (code == 0 && count > 0)
+		code = mend_parts(&tools, input->steps, parts, count, &input->opposite, err);
+	free(bad);
+	free(parts);
+	return code;
 }
 
 void input_hold_out(struct input *input, const int *views, int count)

@@ -4,6 +4,7 @@
 #include "core/correct/binning.h"
 #include "core/correct/content.h"
 #include "core/correct/defects.h"
+#include "core/correct/mend.h"
 #include "core/correct/outliers.h"
 
 /* Views of a job that keeps no projections which may have to be taken out of the FDK volume again, at most. */
@@ -30,6 +31,20 @@ struct input {
 	/* [views of the scan], owned; the second one of input_settle. */
 	struct view_profile *profiles;
 	struct outlier *outliers;
+	/*
+	 * [views of the scan], owned, of input_settle: runs between two steps, and [mended_count] those of their views
+	 * that are made whole again. Such a view is an outlier as well, and none of the blank ones.
+	 */
+	struct step *steps;
+	int *mended, mended_count;
+	double opposite; /* the share of mended parts that comes from the rays that run the other way */
+	/* [views of the scan], owned: the defects of each view, and what was seen at its edges where it was looked at.
+	 */
+	struct defect_counts *defects;
+	struct view_edges {
+		bool looked_at, ends[2], far_off;
+		float air;
+	} * edges;
 	/* [row][column], line integrals as FDK took them, of views that may be outliers, owned. */
 	struct {
 		int view;
@@ -51,8 +66,8 @@ struct input {
 	float most; /* of them, at least 0 */
 	size_t looked_at;
 	/*
-	 * About 32 views are looked at: how many were, and how many had something that is not air on the first row and
-	 * on the last one.
+	 * About 32 views are looked at, but for those that are mended: how many were, and how many had something that
+	 * is not air on the first row and on the last one. Known behind input_settle, as the following.
 	 */
 	int look_every, views_looked_at, ends[2];
 	/*
@@ -102,9 +117,17 @@ const float *input_copy_of(const struct input *input, int view);
 /*
  * Called once, when all views have come: those that show nothing (content.h), and outliers (outliers.h) if all views
  * are kept or there is a copy, are blank ones from now on. Returns how many it found, the last ones of the list;
- * ERR_IMPOSSIBLE where no view has a good pixel.
+ * ERR_IMPOSSIBLE where no view has a good pixel. Views between two steps (steps.h) are to be mended then.
  */
 int input_settle(struct input *input, const struct orbit *orbit, bool keeps_all, struct error *err);
+
+/*
+ * Makes the views that are to be mended whole in `projections`, which keeps all views where keeps_all; otherwise the
+ * levels alone are to be taken off the copies.
+ */
+int input_mend(struct input *input, const struct backend *backend, struct stack *projections,
+	       const struct geometry *geometry, const struct orbit *orbit, bool keeps_all, const struct cancel *cancel,
+	       struct error *err);
 
 /* Called once, behind input_settle: these views, none of them blank, are blank ones from now on. */
 void input_hold_out(struct input *input, const int *views, int count);

@@ -5,6 +5,7 @@
 #include <math.h>
 #include <stdio.h>
 #include <stdlib.h>
+#include <string.h>
 
 #include "core/clock.h"
 #include "core/correct/averaging.h"
@@ -301,6 +302,29 @@ static int take_back(struct recon *recon, const int *views, int count, struct er
 	return code == 0 ? backend->volume_axpby(-1, recon->volume, 0, recon->volume, err) : code;
 }
 
+/*
+ * Adds the views that are mended to the FDK volume as they are then. Of projections that are not kept, a copy has had
+ * another dose.
+ */
+static int add_mended(struct recon *recon, struct error *err)
+{
+	const struct input *input = &recon->input;
+	const bool keeps = keeps_projections(&recon->recipe);
+	int code = 0;
+
+	for (int i = 0; i < input->mended_count && code == 0; i++) {
+		const int view = input->mended[i], slot = keeps ? view : recon->fdk.pending;
+
+		if (held_out_has(recon->held_out, view))
+			continue;
+		if (!keeps)
+			code = restore_view(recon, view, slot, err);
+		if (code == 0)
+			code = fdk_add(&recon->fdk, view, slot, recon->projections, recon->volume, err);
+	}
+	return code == 0 ? fdk_flush(&recon->fdk, recon->projections, recon->volume, err) : code;
+}
+
 /* Makes the slots of views say nothing, where there are such slots. */
 static int empty_slots(struct recon *recon, const int *views, int count, struct error *err)
 {
@@ -333,14 +357,29 @@ static int hold_out(struct recon *recon, struct error *err)
  * nothing; so do those of views that are held out. */
 static int leave_out(struct recon *recon, struct error *err)
 {
-	const int found = input_settle(&recon->input, &recon->orbit, keeps_projections(&recon->recipe), err);
-	const int *views = recon->input.blank + recon->input.counts.blank - (found > 0 ? found : 0);
-	int code = found < 0 ? found : 0;
+	struct input *input = &recon->input;
+	const bool keeps = keeps_projections(&recon->recipe);
+	const int found = input_settle(input, &recon->orbit, keeps, err);
+	const int *views = input->blank + input->counts.blank - (found > 0 ? found : 0);
+	const int mended = input->mended_count;
+	int *spoiled = NULL, code = found < 0 ? found : 0;
 
-	if (found > 0 && recon_runs_fdk(recon))
-		code = take_back(recon, views, found, err);
+	if (code == 0 && found + mended > 0 && recon_runs_fdk(recon)) {
+		spoiled = malloc((size_t)(found + mended) * sizeof(*spoiled));
+		if (spoiled == NULL)
+			return error_set(err, ERR_NO_MEMORY, "no memory for a list of %d views", found + mended);
+		memcpy(spoiled, views, (size_t)found * sizeof(*spoiled));
+		memcpy(spoiled + found, input->mended, (size_t)mended * sizeof(*spoiled));
+		code = take_back(recon, spoiled, found + mended, err);
+		free(spoiled);
+	}
 	if (code == 0)
 		code = empty_slots(recon, views, found, err);
+	if (code == 0 && mended > 0)
+		code = input_mend(input, recon->backend, recon->projections, recon->geometry, &recon->orbit, keeps,
+				  &recon->cancel, err);
+	if (code == 0 && mended > 0 && recon_runs_fdk(recon))
+		code = add_mended(recon, err);
 	return code == 0 ? hold_out(recon, err) : code;
 }
 

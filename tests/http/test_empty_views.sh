@@ -1,6 +1,7 @@
 #!/usr/bin/env bash
 # Views that show nothing, or do not follow those beside them, among those of a head, four of 60: told, and left out, in
-# a job of all defaults; and a scan that shows nothing at all: told.
+# a job of all defaults; and a scan that shows nothing at all: told. Views between two steps of the signal: told, and made
+# whole.
 . "$(dirname "$0")/lib.sh"
 
 head=(--phantom head --scale 60 --density 0.02 --views 60 --arc 360 --columns 64 --rows 48 --pixel 4
@@ -9,7 +10,11 @@ cbct simulate "${head[@]}" -o "$work/good" >/dev/null || exit 1
 cp -r "$work/good" "$work/empty"
 cp -r "$work/good" "$work/air"
 cp -r "$work/good" "$work/outliers"
-/usr/bin/env python3 - "$work"/{good,empty,air,outliers}/projections.raw <<'EOF' || exit 1
+cbct simulate "${head[@]}" --views 120 -o "$work/dense" >/dev/null || exit 1
+cp -r "$work/dense" "$work/part"
+cp -r "$work/dense" "$work/dark"
+cp -r "$work/dense" "$work/dose"
+/usr/bin/env python3 - "$work"/{good,empty,air,outliers,dense,part,dark,dose}/projections.raw <<'EOF' || exit 1
 import array, random, sys
 random.seed(5)
 pixels, views = 64 * 48, 60
@@ -30,6 +35,15 @@ for view in range(views):
             outliers[view * pixels + i] *= i % 64 < 32
         elif view == 52:
             outliers[view * pixels + i] = good[51 * pixels + i]
+dense = array.array('f', open(sys.argv[5], 'rb').read())
+part, dark, dose = (array.array('f', dense) for _ in range(3))
+for at in range(50 * pixels, 80 * pixels):
+    dose[at] *= 0.5
+    if at < 62 * pixels and at % 64 < 32:
+        part[at] *= 0.01
+        dark[at] = 0
+for name, data in zip(sys.argv[6:], (part, dark, dose)):
+    open(name, 'wb').write(data.tobytes())
 open(sys.argv[2], 'wb').write(empty.tobytes())
 open(sys.argv[3], 'wb').write(air.tobytes())
 open(sys.argv[4], 'wb').write(outliers.tobytes())
@@ -57,6 +71,26 @@ test_views_that_do_not_follow_are_told_and_left_out() {
 	done
 	get_volume final "$work/outliers.nii"
 	expect_number "$(cbct compare --json "$work/outliers.nii" "$work/good.nii" | jq '.rmse / 0.0192 * 1000')" '<' 12 "RMSE in HU"
+}
+
+# Of 120 views twelve of which a half has a hundredth of its signal, or none, and thirty with half of the dose: some 180, 30
+# and 70 HU where they are believed.
+test_views_between_two_steps_are_made_whole() {
+	local row name code
+	reconstruct "$work/dense" "{\"scan\": \"SCAN\", $grid}"
+	expect_json '.warnings | all(.code != "dark_parts" and .code != "dose_steps")'
+	json '[.warnings[].code] | sort | join(" ")' >"$work/codes"
+	get_volume final "$work/dense.nii"
+	for row in 'part dark_parts ^12' 'dark dark_parts ^12' 'dose dose_steps ^30'; do
+		read -r name code told <<<"$row"
+		reconstruct "$work/$name" "{\"scan\": \"SCAN\", $grid}"
+		expect_json "[.warnings[] | select(.code == \"$code\") | .severity, (.detail | test(\"$told projections, the first of them is 50,\"))] == [\"caution\", true]"
+		# and by that warning alone
+		[ "$(json "[.warnings[].code | select(. != \"$code\")] | sort | join(\" \")")" = "$(cat "$work/codes")" ] ||
+			fail "$name: other warnings than those of the good scan"
+		get_volume final "$work/$name.nii"
+		expect_number "$(cbct compare --json "$work/$name.nii" "$work/dense.nii" | jq '.rmse / 0.0192 * 1000')" '<' 5 "$name: RMSE in HU"
+	done
 }
 
 test_a_scan_of_air_is_told() {
