@@ -30,3 +30,13 @@ float select_kth(float *values, int count, int k)
 	}
 	return values[k];
 }
+
+float select_median(float *values, int count)
+{
+	float lower;
+
+	if (count == 0)
+		return 0;
+	lower = select_kth(values, count, (count - 1) / 2);
+	return 0.5f * (lower + select_kth(values, count, count / 2));
+}

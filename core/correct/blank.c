@@ -103,14 +103,6 @@ struct outlier_report {
 	float amount; /* of the worst */
 };
 
-static bool is_mended(const struct input *input, int view)
-{
-	for (int i = 0; i < input->mended_count; i++)
-		if (input->mended[i] == view)
-			return true;
-	return false;
-}
-
 static struct outlier_report report_of(const struct input *input, int views, enum outlier_kind kind)
 {
 	struct outlier_report report = {0};
@@ -121,7 +113,7 @@ static struct outlier_report report_of(const struct input *input, int views, enu
 		if (outlier->kind != kind)
 			continue;
 		report.count++;
-		report.mended += is_mended(input, i);
+		report.mended += input_is_mended(input, i);
 		report.first = i;
 		if (fabsf(outlier->amount) >= fabsf(report.amount)) {
 			report.worst = i;

@@ -290,7 +290,7 @@ static int look_at_ends(struct input *input, const void *samples, int columns, i
 	return look_at_air(input, samples, columns, rows, largest, edges, err);
 }
 
-static bool is_mended(const struct input *input, int view)
+bool input_is_mended(const struct input *input, int view)
 {
 	for (int i = 0; i < input->mended_count; i++)
 		if (input->mended[i] == view)
@@ -304,7 +304,7 @@ static void add_edges(struct input *input, int views)
 	for (int view = 0; view < views; view++) {
 		const struct view_edges *edges = &input->edges[view];
 
-		if (!edges->looked_at || is_mended(input, view))
+		if (!edges->looked_at || input_is_mended(input, view))
 			continue;
 		input->views_looked_at++;
 		for (int end = 0; end < 2; end++)
@@ -520,7 +520,7 @@ static int add_outliers(struct input *input, const bool *skip, const struct orbi
 	int code = outliers_find(input->profiles, skip, orbit, input->outliers, err);
 
 	for (int view = 0; view < orbit->count && code >= 0; view++) {
-		const bool mended = is_mended(input, view);
+		const bool mended = input_is_mended(input, view);
 
 		if (input->steps[view].kind != STEP_NONE)
 			input->outliers[view] = outlier_of(&input->steps[view]);

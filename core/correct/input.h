@@ -113,6 +113,8 @@ int input_copy(struct input *input, const struct backend *backend, struct stack 
 	       struct error *err);
 /* The copy of a view; NULL: there is none. */
 const float *input_copy_of(const struct input *input, int view);
+/* Whether input_settle has found the view to lie between two steps, and to be mended. */
+bool input_is_mended(const struct input *input, int view);
 
 /*
  * Called once, when all views have come: those that show nothing (content.h), and outliers (outliers.h) if all views

@@ -225,6 +225,13 @@ static void whole_clear(struct whole *whole)
 	free(whole->view);
 }
 
+size_t mend_bytes(int columns, int rows)
+{
+	const size_t pixels = (size_t)columns * (size_t)rows;
+
+	return (2 * AT_ONCE + 1) * pixels * sizeof(float) + AT_ONCE * (size_t)columns * sizeof(struct partners);
+}
+
 static int whole_open(struct whole *whole, const struct mend_tools *tools, struct error *err)
 {
 	const size_t columns = (size_t)tools->geometry->columns, pixels = columns * (size_t)tools->geometry->rows;

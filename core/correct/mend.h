@@ -35,6 +35,9 @@ struct mend_area mend_area_of(const struct step *step, int columns, int rows);
 int mend_parts(const struct mend_tools *tools, const struct step *steps, const int *views, int count,
 	       double *ret_opposite, struct error *err);
 
+/* Bytes of the host that mend_parts works in. */
+size_t mend_bytes(int columns, int rows);
+
 /* Takes a level off a view. */
 int mend_level(const struct mend_tools *tools, int view, float level, struct error *err);
 

@@ -6,6 +6,7 @@
 #include <string.h>
 
 #include "core/error.h"
+#include "core/select.h"
 
 enum { BLOCKS = CONTENT_BLOCKS * CONTENT_BLOCKS, BLOCKS_LEAST = 6, VIEWS_LEAST = 8 };
 
@@ -71,19 +72,6 @@ static float between_values(const struct between *at, float before, float behind
 	return before + at->share * (behind - before);
 }
 
-static int compare_floats(const void *a, const void *b)
-{
-	const float x = *(const float *)a, y = *(const float *)b;
-
-	return (x > y) - (x < y);
-}
-
-static float median_of(float *values, int count)
-{
-	qsort(values, (size_t)count, sizeof(*values), compare_floats);
-	return count > 0 ? 0.5f * (values[(count - 1) / 2] + values[count / 2]) : 0;
-}
-
 /* The median of how much the blocks of one view exceed those of another; *ret_blocks: those that both know. */
 static float level_between(const struct view_profile *view, const struct view_profile *other, int *ret_blocks)
 {
@@ -94,7 +82,7 @@ static float level_between(const struct view_profile *view, const struct view_pr
 		if (!isnan(view->block[b] - other->block[b]))
 			apart[count++] = view->block[b] - other->block[b];
 	*ret_blocks = count;
-	return median_of(apart, count);
+	return select_median(apart, count);
 }
 
 static bool is_dark(const struct between *at, float *ret_amount)
@@ -124,7 +112,7 @@ static bool is_level(const struct between *at, float *ret_amount)
 	if (count < BLOCKS_LEAST)
 		return false;
 	memcpy(sorted, apart, sizeof(sorted));
-	level = median_of(sorted, count);
+	level = select_median(sorted, count);
 	if (fabsf(level) < (at_end ? LEVEL_AT_END : LEVEL) ||
 	    fabsf(level) < CALM * fabsf(level_between(behind, other, &known)))
 		return false;
@@ -367,7 +355,8 @@ static int mark_frozen(const struct ring *ring, struct outlier *ret_outliers, st
 		shown[count] = (float)apart_by(ring->views[view].along[0], none, 0);
 		apart[count++] = (float)off;
 	}
-	if (code == 0 && count > 0 && median_of(apart, count) <= ROUNDING * ROUNDING * median_of(shown, count)) {
+	if (code == 0 && count > 0 &&
+	    select_median(apart, count) <= ROUNDING * ROUNDING * select_median(shown, count)) {
 		memset(ret_outliers, 0, (size_t)ring->all * sizeof(*ret_outliers));
 		found = 0;
 	}

@@ -6,6 +6,7 @@
 #include <string.h>
 
 #include "core/error.h"
+#include "core/select.h"
 
 enum { SIDE = CONTENT_BLOCKS, BLOCKS = SIDE * SIDE, VIEWS_LEAST = 8, KNOWN_LEAST = 16 };
 enum { BAND_LEAST = SIDE / 4, BAND_MOST = 3 * SIDE / 4, AIR_LEAST = 4 };
@@ -16,15 +17,19 @@ static const double NEAR = 10;                        /* degrees between a view 
 static const float LEVEL = 0.15f, PART = 0.5f;        /* line integrals: the least steps */
 static const float AGREE = 0.25f, AGREE_PART = 0.15f; /* of the step, and at least so many standard deviations */
 static const float NOISE = 3;
-static const double MOST_BLOCKS = 0.85;            /* of the part that agree */
-static const float ELSEWHERE = 0.25f;              /* of the step, at most, in the blocks beside the part */
-static const double FEW_BLOCKS = 0.05;             /* of those, which may do more, */
-static const float ELSEWHERE_MOST = 0.5f;          /* but not more than this */
-static const float BACK = 0.25f, CALM = 0.25f;     /* of the step */
-static const float BORDER = 0.35f;                 /* of the step */
-enum { BETWEEN = 2 };                              /* samples of a profile */
-static const float BEFORE = 0.25f;                 /* of the unusable samples of a dark view */
-static const double WIDE = 60;                     /* degrees from one side of a part's run to the other */
+static const double MOST_BLOCKS = 0.85;        /* of the part that agree */
+static const float ELSEWHERE = 0.25f;          /* of the step, at most, in the blocks beside the part */
+static const double FEW_BLOCKS = 0.05;         /* of those, which may do more, */
+static const float ELSEWHERE_MOST = 0.5f;      /* but not more than this */
+static const float BACK = 0.25f, CALM = 0.25f; /* of the step */
+static const float BORDER = 0.35f;             /* of the step */
+enum { BETWEEN = 2 };                          /* samples of a profile */
+static const float BEFORE = 0.25f;             /* of the unusable samples of a dark view */
+/*
+ * Degrees from one side of a part's run to the other, at most; the second for parts that go dark, as parts of a panel
+ * do which metal hides.
+ */
+static const double WIDE = 120, WIDE_DARK = 60;
 static const float AIR = 0.03f, AIR_AGREE = 0.01f; /* line integrals */
 
 struct area {
@@ -49,19 +54,6 @@ static int compare_places(const void *a, const void *b)
 
 	return x->angle != y->angle ? (x->angle > y->angle) - (x->angle < y->angle)
 				    : (x->view > y->view) - (x->view < y->view);
-}
-
-static int compare_floats(const void *a, const void *b)
-{
-	const float x = *(const float *)a, y = *(const float *)b;
-
-	return (x > y) - (x < y);
-}
-
-static float median_of(float *values, int count)
-{
-	qsort(values, (size_t)count, sizeof(*values), compare_floats);
-	return count > 0 ? 0.5f * (values[(count - 1) / 2] + values[count / 2]) : 0;
 }
 
 /* NULL beyond the ends of an arc. */
@@ -120,7 +112,7 @@ static float median_step(const struct view_profile *from, const struct view_prof
 			steps[count++] = magnitude ? fabsf(step) : step;
 	}
 	*ret_count = count;
-	return median_of(steps, count);
+	return select_median(steps, count);
 }
 
 /*
@@ -238,12 +230,12 @@ static bool is_calm(const struct ring *ring, int place, const struct area *area,
 	return median_step(from, to, area, true, &count) <= CALM * fabsf(step) && (!isinf(step) || count > 0);
 }
 
-/* True if a run behind a place turns by less than WIDE from side to side. */
-static bool is_short(const struct ring *ring, int place, int run)
+/* True if a part's run behind a place turns by no more than such a run may, from side to side. */
+static bool is_short(const struct ring *ring, int place, int run, float step)
 {
 	const double turn = place_at(ring, place + run + 1)->angle - place_at(ring, place)->angle;
 
-	return (turn < 0 ? turn + 2 * PI : turn) <= WIDE * PI / 180;
+	return (turn < 0 ? turn + 2 * PI : turn) <= (isinf(step) ? WIDE_DARK : WIDE) * PI / 180;
 }
 
 /* True if the second step takes the first one back. */
@@ -277,7 +269,7 @@ static int mark_run(const struct ring *ring, int place, const struct area *area,
 		if (!goes_on(ring, place + run, area, step))
 			return 0;
 	}
-	if (run * MOST >= ring->count || (!is_whole(area) && !is_short(ring, place, run)) ||
+	if (run * MOST >= ring->count || (!is_whole(area) && !is_short(ring, place, run, step)) ||
 	    !is_calm(ring, place + run + 1, area, step))
 		return 0;
 	for (int i = 0; i <= run + 1; i++)
@@ -357,6 +349,7 @@ bool steps_air(const struct view_profile *views, const struct step *step, int vi
 	const struct view_profile *sides[2] = {&views[step->sides[0]], &views[step->sides[1]]};
 	float own[BLOCKS];
 	double sum = 0;
+	float usual;
 	int count = 0, agree = 0;
 
 	for (int b = 0; b < BLOCKS; b++)
@@ -366,9 +359,9 @@ bool steps_air(const struct view_profile *views, const struct step *step, int vi
 	if (count < AIR_LEAST)
 		return false;
 	/* A body that reaches into some of these blocks meanwhile makes them larger. */
-	qsort(own, (size_t)count, sizeof(*own), compare_floats);
+	usual = select_kth(own, count, count / 4);
 	for (int i = 0; i < count; i++)
-		if (fabsf(own[i] - own[count / 4]) <= AIR_AGREE + NOISE * views[view].noise) {
+		if (fabsf(own[i] - usual) <= AIR_AGREE + NOISE * views[view].noise) {
 			sum += (double)own[i];
 			agree++;
 		}

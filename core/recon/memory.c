@@ -8,6 +8,7 @@
 #include "core/recon/algorithm.h"
 #include "core/correct/correction.h"
 #include "core/correct/counts.h"
+#include "core/correct/mend.h"
 #include "core/correct/rings.h"
 #include "core/outofcore/outofcore.h"
 #include "core/recon/internal.h"
@@ -163,12 +164,14 @@ void recon_release(struct recon *recon)
 
 /* ---- the sum ---- */
 
-/* The host's, for what is taken out of volumes that are kept, and said of them. */
+/* The host's, for views that are made whole, and what is taken out of volumes that are kept, and said of them. */
 static size_t kept_bytes(const struct recon *recon)
 {
 	const struct recipe *recipe = &recon->recipe;
 	size_t bytes = support_bytes(&recipe->grid);
 
+	if (keeps_projections(recipe))
+		bytes += mend_bytes(recon->geometry->columns, recon->geometry->rows);
 	if (recipe->hold_out)
 		bytes += held_out_bytes(recon->geometry);
 	if (recipe->rings)

@@ -5,6 +5,7 @@
 #include <string.h>
 
 #include "core/correct/content.h"
+#include "core/correct/steps.h"
 #include "tests/unit/data.h"
 #include "tests/unit/scene.h"
 
@@ -76,6 +77,127 @@ START_TEST(a_gap_among_views_of_an_object_is_found)
 		orbit_clear(&orbit);
 		scene_clear(&scene);
 	}
+}
+END_TEST
+
+/* ---- views between two steps ---- */
+
+/* What a pixel at column u, row v, 0 to 1, shows at an angle: an ellipsoid that lies aside of the axis, in air. */
+static float body_at(double u, double v, double angle)
+{
+	const double x = (u - 0.5 - 0.08 * cos(angle)) / (0.3 + 0.08 * cos(2 * angle)), y = (v - 0.5) / 0.7;
+	const double inside = 1 - x * x - y * y;
+
+	return inside > 0 ? (float)(4 * sqrt(inside)) : 0;
+}
+
+/* A band of blocks from this column and row on that gives another signal, by so much; INFINITY: none. */
+struct band {
+	int first[2], end[2];
+	double step;
+};
+
+static struct view_profile profile_at(double angle, const struct band *band, double share)
+{
+	enum { SAMPLES = OUTLIERS_SAMPLES, EACH = CONTENT_SAMPLES };
+	struct profile_sums sums = {0};
+	struct content_sums blocks = {0};
+	int nothing = 0;
+
+	for (int r = 0; r < SAMPLES; r++)
+		for (int c = 0; c < SAMPLES; c++) {
+			const int block = r / EACH * CONTENT_BLOCKS + c / EACH;
+			float p = body_at((c + 0.5) / SAMPLES, (r + 0.5) / SAMPLES, angle);
+
+			if (share > 0 && c / EACH >= band->first[0] && c / EACH < band->end[0] &&
+			    r / EACH >= band->first[1] && r / EACH < band->end[1])
+				p = isinf(band->step) ? NAN : p + (float)(share * band->step);
+			nothing += isnan(p);
+			profile_add(&sums, c, r, block, p);
+			if (!isnan(p)) {
+				blocks.sum[block] += (double)p;
+				blocks.count[block]++;
+			}
+		}
+	return profile_of(&sums, &blocks, 0.01f, (double)nothing / (SAMPLES * SAMPLES));
+}
+
+#define LEFT_HALF                                                                                                      \
+	{0, 0},                                                                                                        \
+	{                                                                                                              \
+		4, 8                                                                                                   \
+	}
+#define ALL_OF_IT                                                                                                      \
+	{0, 0},                                                                                                        \
+	{                                                                                                              \
+		8, 8                                                                                                   \
+	}
+/* A run of views between two steps is found at its very ends, and what is no such run is not. */
+START_TEST(views_between_two_steps_are_found)
+{
+	static const struct {
+		struct band band;
+		double apart; /* degrees; a full turn */
+		int first, count, found;
+		double ramp; /* share of the step in the first and the last view of the run */
+	} rows[] = {
+	    {{ALL_OF_IT, .69}, 3, 40, 30, 30, 1},   /* half of the dose */
+	    {{ALL_OF_IT, -.69}, 3, 100, 40, 40, 1}, /* twice, over the end of the turn */
+	    {{ALL_OF_IT, .69}, 3, 40, 70, 50, 1},   /* the fewer ones are told */
+	    {{ALL_OF_IT, .1}, 3, 40, 30, 0, 1},     /* less than is told */
+	    {{LEFT_HALF, 4.6}, 3, 40, 12, 12, 1},   /* a hundredth of the signal */
+	    {{LEFT_HALF, 4.6}, 4, 61, 18, 18, 1},   /* over 76 degrees */
+	    {{LEFT_HALF, 4.6}, 3, 40, 1, 1, 1},       {{LEFT_HALF, 4.6}, 3, 20, 41, 0, 1}, /* over 126 degrees */
+	    {{{0, 0}, {8, 2}, 2}, 3, 30, 10, 10, 1},                                       /* a quarter of the rows */
+	    {{{0, 0}, {8, 2}, .69}, 3, 30, 10, 0, 1}, /* the body changes by as much at its edge */
+	    {{{6, 0}, {8, 8}, -2}, 3, 30, 10, 10, 1}, /* a quarter of the columns */
+	    {{{3, 0}, {5, 8}, 2}, 3, 30, 10, 0, 1},   /* a band that lies within */
+	    {{LEFT_HALF, .3}, 3, 40, 12, 0, 1},       {{LEFT_HALF, INFINITY}, 3, 40, 12, 12, 1},
+	    {{LEFT_HALF, INFINITY}, 3, 40, 24, 0, 1}, /* over 75 degrees */
+	    {{ALL_OF_IT, .69}, 12, 5, 6, 0, 1},       /* views that are too far apart */
+	    {{LEFT_HALF, 4.6}, 3, 40, 12, 0, .4},     /* comes and goes */
+	    {{ALL_OF_IT, 0}, 3, 0, 0, 0, 1},
+	};
+	const int views = (int)lround(360 / rows[_i].apart);
+	const struct orbit_spec spec = {8, 8, views, {600, 1100, {10, 10}, {0, 0}, {0, 0}}, 30, rows[_i].apart};
+	struct view_profile *profiles = calloc((size_t)views, sizeof(*profiles));
+	struct step *steps = calloc((size_t)views, sizeof(*steps));
+	bool *skip = calloc((size_t)views, sizeof(*skip));
+	struct scene scene;
+	struct orbit orbit;
+	struct error err;
+
+	scene_orbit(&scene, &spec);
+	ck_assert_int_eq(orbit_analyse(&orbit, &scene.geometry, &err), 0);
+	for (int i = 0; i < views; i++) {
+		const int place = (i - rows[_i].first + views) % views;
+		const bool is_in = place < rows[_i].count, at_end = place == 0 || place == rows[_i].count - 1;
+
+		profiles[i] = profile_at((30 + i * rows[_i].apart) * acos(-1) / 180, &rows[_i].band,
+					 !is_in   ? 0
+					 : at_end ? rows[_i].ramp
+						  : 1);
+	}
+	ck_assert_int_eq(steps_find(profiles, skip, &orbit, steps, &err), rows[_i].found);
+	for (int i = 0; i < views && rows[_i].found > 0 && 2 * rows[_i].count <= views; i++) {
+		const bool is_in = (i - rows[_i].first + views) % views < rows[_i].count;
+
+		ck_assert_msg((steps[i].kind != STEP_NONE) == is_in, "row %d: view %d", _i, i);
+		if (!is_in)
+			continue;
+		for (int a = 0; a < 2; a++) {
+			ck_assert_int_eq(steps[i].first[a], rows[_i].band.first[a]);
+			ck_assert_int_eq(steps[i].end[a], rows[_i].band.end[a]);
+		}
+		if (!isinf(rows[_i].band.step))
+			ck_assert_float_eq_tol(steps[i].level, (float)rows[_i].band.step,
+					       .1f * fabsf((float)rows[_i].band.step));
+	}
+	orbit_clear(&orbit);
+	scene_clear(&scene);
+	free(profiles);
+	free(steps);
+	free(skip);
 }
 END_TEST
 
@@ -450,6 +572,7 @@ Suite *content_suite(void)
 
 	tcase_set_timeout(tests, 60);
 	tcase_add_loop_test(tests, a_gap_among_views_of_an_object_is_found, 0, 2);
+	tcase_add_loop_test(tests, views_between_two_steps_are_found, 0, 18);
 	tcase_add_loop_test(tests, views_that_show_nothing_are_told_and_left_out, 0, TRIES);
 	tcase_add_loop_test(tests, views_that_do_not_follow_are_told_and_left_out, 0, 2 * OUTLYING);
 	tcase_add_loop_test(tests, no_view_of_an_object_is_taken_for_nothing, 0,
