@@ -11,6 +11,7 @@
 #include "clients/cbct/progress.h"
 #include "clients/cbct/recipe_options.h"
 #include "clients/cbct/warning.h"
+#include "core/cards/cards.h"
 #include "proto/provenance.h"
 #include "proto/reconstruction.h"
 #include "proto/scan_directory.h"
@@ -182,13 +183,31 @@ static void become_cuda(void)
 	free(text);
 }
 
+/* The device of a job, or that which all of its devices make, from --device on. */
+static int open_device(const struct recon_options *options, int count, const struct backend **backend,
+		       struct device **ret_device, struct error *err)
+{
+	const struct device_options device_options = {.threads = (int)options->threads};
+	int indices[CARDS_MOST];
+	int code;
+
+	if (count == DEVICES_ALL)
+		return error_set(err, ERR_USAGE, "--devices: how many, 1 to %d; 'all' is a daemon's to say", CARDS_MOST);
+	if (count <= 1)
+		return (*backend)->open((int)options->device, &device_options, ret_device, err);
+	for (int i = 0; i < CARDS_MOST; i++)
+		indices[i] = (int)options->device + i;
+	code = cards_open(*backend, indices, count, &device_options, ret_device, err);
+	*backend = &backend_cards;
+	return code;
+}
+
 static int pipeline_run(const struct recon_options *options, const struct job_request *request, const cJSON *warnings,
 			struct error *err)
 {
 	const struct recipe *recipe = &request->recipe;
 	const struct backend *backend = backend_find(options->backend);
 	const char *output = options->output != NULL ? options->output : options->directory;
-	const struct device_options device_options = {.threads = (int)options->threads};
 	struct display display = {.iterations = recipe->algorithm != NULL ? recipe_iterations(recipe) : 0,
 				  .residual = -1};
 	const struct reconstruction_hooks hooks = {
@@ -216,8 +235,8 @@ static int pipeline_run(const struct recon_options *options, const struct job_re
 		return error_set(err, ERR_USAGE, "--backend: '%s' is none that this program has", options->backend);
 	if (mkdir(output, 0777) != 0 && errno != EEXIST)
 		return error_set_errno(err, errno, "%s", output);
-	backend_host_threads(device_options.threads);
-	code = backend->open((int)options->device, &device_options, &device, err);
+	backend_host_threads((int)options->threads);
+	code = open_device(options, request->devices, &backend, &device, err);
 	if (code != 0)
 		return code;
 	if (!options->quiet)

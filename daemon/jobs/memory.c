@@ -52,6 +52,11 @@ static int memory_needed(const char *backend, int devices, const struct scan *sc
 			return code;
 		code = recon_memory(&backend_cards, cards, geometry, &linearise, recipe, ret_memory, err);
 		backend_cards.close(cards);
+		/* Not even in parts: what another attempt would not change. */
+		if (code == ERR_NO_MEMORY)
+			return error_set_at(err, ERR_IMPOSSIBLE, "/grid/size",
+					    "the job does not fit into the memory of %d devices, not even in parts",
+					    devices);
 		/* Where the job would not fit just now, it is counted as it would run out of core. */
 		ret_memory->total += code == 0 ? ret_memory->host : 0;
 		return code;

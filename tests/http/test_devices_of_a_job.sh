@@ -72,6 +72,14 @@ test_a_job_has_several_devices() {
 	# The same number of devices, the same bits; another number, the same within rounding.
 	post_job "$(with "$recipe" '"devices": 2')" && wait_job succeeded && whole=$(digests)
 	get_volume final "$work/two.raw" format=raw
+	get_volume final "$work/two.nii"
+	# The command that needs no daemon has them, too.
+	with "$recipe" '"devices": 2' >"$work/two.json"
+	rm -rf "$work/alone"
+	cbct recon "$scan_dir" "$work/two.json" --backend cpu --threads 2 --quiet -o "$work/alone"
+	expect_number "$(cbct compare --json "$work/two.nii" "$work/alone/final.nii" | jq .rmse)" == 0 "difference to cbct recon"
+	! cbct recon "$scan_dir" --devices all --backend cpu -o "$work/alone" 2>"$work/said" || fail "all of no daemon"
+	grep -q "how many" "$work/said" || fail "the reason, got $(cat "$work/said")"
 	post_job "$(with "$recipe" '"devices": 2')" && wait_job succeeded && [ "$(digests)" = "$whole" ] || fail "the same bits"
 	post_job "$(with "$recipe" '"devices": "all"')" && wait_job succeeded
 	expect_json '.ran_on == [0, 1, 2] and .devices == "all" and .warnings == []'
@@ -85,6 +93,12 @@ PYTHON
 	)" "<" 1e-5 "difference between two and three devices"
 	req POST /v1/jobs -H 'Content-Type: application/json' --data-binary "$(with "${recipe//SCAN/$scan}" '"devices": 4')"
 	expect_problem 422 /devices
+	# What fits into no memory is refused as for one device.
+	for count in 1 3 '"all"'; do
+		req POST /v1/jobs -H 'Content-Type: application/json' --data-binary \
+			"{\"scan\": \"$scan\", \"grid\": {\"size\": [2048, 2048, 2048], \"spacing_mm\": [0.05, 0.05, 0.05]}, \"cgls\": {\"iterations\": 2}, \"tv\": {\"method\": \"tgv\"}, \"devices\": $count}"
+		expect_problem 422 /grid/size
+	done
 	for wrong in 0 17 '"some"' 1.5; do
 		req POST /v1/jobs -H 'Content-Type: application/json' --data-binary "$(with "${recipe//SCAN/$scan}" "\"devices\": $wrong")"
 		[[ $status == 4* ]] && expect_problem "$status" /devices
