@@ -192,7 +192,8 @@ static int open_device(const struct recon_options *options, int count, const str
 	int code;
 
 	if (count == DEVICES_ALL)
-		return error_set(err, ERR_USAGE, "--devices: how many, 1 to %d; 'all' is a daemon's to say", CARDS_MOST);
+		return error_set(err, ERR_USAGE, "--devices: how many, 1 to %d; 'all' is a daemon's to say",
+				 CARDS_MOST);
 	if (count <= 1)
 		return (*backend)->open((int)options->device, &device_options, ret_device, err);
 	for (int i = 0; i < CARDS_MOST; i++)

@@ -582,6 +582,11 @@ static void take_off_copy(struct input *input, int view, float level)
 			input->copies[i].slot[at] -= level;
 }
 
+size_t input_mend_bytes(const struct geometry *geometry)
+{
+	return mend_bytes(geometry->columns, geometry->rows);
+}
+
 int input_mend(struct input *input, const struct backend *backend, struct stack *projections,
 	       const struct geometry *geometry, const struct orbit *orbit, bool keeps_all, const struct cancel *cancel,
 	       struct error *err)

@@ -130,6 +130,8 @@ int input_settle(struct input *input, const struct orbit *orbit, bool keeps_all,
 int input_mend(struct input *input, const struct backend *backend, struct stack *projections,
 	       const struct geometry *geometry, const struct orbit *orbit, bool keeps_all, const struct cancel *cancel,
 	       struct error *err);
+/* Bytes of the host that input_mend works in, where all views are kept. */
+size_t input_mend_bytes(const struct geometry *geometry);
 
 /* Called once, behind input_settle: these views, none of them blank, are blank ones from now on. */
 void input_hold_out(struct input *input, const int *views, int count);

@@ -14,7 +14,8 @@
  * different values, one after the other, and what metal hides has no straight border from edge to edge.
  *
  * The part is a band of a quarter to three quarters of the columns or rows at an edge of the detector, with a straight
- * border, and its run turns by 120 degrees at most, or 60 where it goes dark; all of the detector may step for half of the views.
+ * border, and its run turns by 120 degrees at most, or 60 where it goes dark; all of the detector may step for half of
+ * the views.
  */
 enum step_kind { STEP_NONE, STEP_LEVEL, STEP_PART };
 

@@ -8,7 +8,6 @@
 #include "core/recon/algorithm.h"
 #include "core/correct/correction.h"
 #include "core/correct/counts.h"
-#include "core/correct/mend.h"
 #include "core/correct/rings.h"
 #include "core/outofcore/outofcore.h"
 #include "core/recon/internal.h"
@@ -171,7 +170,7 @@ static size_t kept_bytes(const struct recon *recon)
 	size_t bytes = support_bytes(&recipe->grid);
 
 	if (keeps_projections(recipe))
-		bytes += mend_bytes(recon->geometry->columns, recon->geometry->rows);
+		bytes += input_mend_bytes(recon->geometry);
 	if (recipe->hold_out)
 		bytes += held_out_bytes(recon->geometry);
 	if (recipe->rings)
