@@ -75,6 +75,10 @@ const struct warning_kind warning_kinds[] = {
     {"scatter_limited", SEVERITY_CAUTION,
      "The correction for scattered radiation wanted to take nearly all of the signal in some places: gray values may "
      "be wrong there."},
+    {"scatter_exceeds", SEVERITY_SERIOUS,
+     "The scattered radiation given for this scan is more than was measured in many places: the image may be wrong."},
+    {"scatter_spikes", SEVERITY_CAUTION,
+     "Single pixels of the images of scattered radiation were wrong and were replaced from their neighbours."},
     {"air_saturated", SEVERITY_SERIOUS, "The value given for air is one at which the detector is saturated."},
     {"incomplete", SEVERITY_CAUTION, "The scan was broken off: the image is made of the projections that arrived."},
     {"no_flat", SEVERITY_SERIOUS, "The scan lacks its flat image: nothing can be reconstructed before it arrives."},

@@ -2,36 +2,74 @@
 #include "core/correct/scatter_images.h"
 
 #include <math.h>
+#include <stdbool.h>
 #include <stdlib.h>
 #include <string.h>
 
-/* Where a pixel lies among those of an image, along one axis. */
-struct between {
-	int first;   /* the one before it, or the last but one */
-	float share; /* of the one behind */
+#include "core/correct/scatter_spikes.h"
+
+/* What a pixel, or a block of them, has of those of an image along one axis. */
+struct parts {
+	int first, count;
+	float *share; /* [count], of the axis' list */
 };
 
 struct scatter_stack {
 	struct scatter_images images;
 	const struct scatter_source *source;
 	int count[2]; /* pixels along a row and a column */
-	struct between *along[2];
+	struct parts *along[2];
+	float *shares[2];
 	struct {
 		int at; /* of the source's; -1: none yet */
 		float *image;
 	} read[2];
-	float *image; /* of the projection */
+	size_t *spikes; /* [source->count] */
+	float *image;   /* of the projection */
 };
 
-static void place_pixels(struct between *ret, int count, int first, int size, int detector, int most)
+/* Shares of one pixel's value, at `within` image pixels from the first centre, added to those of the block it is in. */
+static void add_pixel(double within, int most, float weight, struct parts *parts)
 {
-	for (int i = 0; i < count; i++) {
-		const double at = (first + (i + 0.5) * size) * most / detector - 0.5;
-		const double within = fmin(fmax(at, 0), most - 1);
+	const int first = within < most - 1 || most == 1 ? (int)within : most - 2;
+	const float behind = (float)(within - first);
 
-		ret[i].first = within < most - 1 || most == 1 ? (int)within : most - 2;
-		ret[i].share = (float)(within - ret[i].first);
+	if (parts->count == 0)
+		parts->first = first;
+	if (parts->count < first - parts->first + (most > 1 ? 2 : 1))
+		parts->count = first - parts->first + (most > 1 ? 2 : 1);
+	parts->share[first - parts->first] += weight * (1 - behind);
+	if (most > 1)
+		parts->share[first - parts->first + 1] += weight * behind;
+}
+
+/* The most image pixels that a block of `size` can touch: those that its pixels' centres lie between. */
+static size_t parts_most(int size, int detector, int most)
+{
+	return (size_t)(ceil((double)(size - 1) * most / detector) + 2);
+}
+
+static int place_pixels(struct scatter_stack *stack, int axis, const struct pixel_blocks *blocks, int detector,
+			int most)
+{
+	const int size = blocks->size[axis];
+	const size_t each = parts_most(size, detector, most);
+
+	stack->along[axis] = calloc((size_t)blocks->count[axis], sizeof(struct parts));
+	stack->shares[axis] = calloc((size_t)blocks->count[axis] * each, sizeof(float));
+	if (stack->along[axis] == NULL || stack->shares[axis] == NULL)
+		return ERR_NO_MEMORY;
+	for (int i = 0; i < blocks->count[axis]; i++) {
+		struct parts *parts = &stack->along[axis][i];
+
+		parts->share = stack->shares[axis] + (size_t)i * each;
+		for (int k = 0; k < size; k++) {
+			const double at = (blocks->first[axis] + i * size + k + 0.5) * most / detector - 0.5;
+
+			add_pixel(fmin(fmax(at, 0), most - 1), most, 1.0F / (float)size, parts);
+		}
 	}
+	return 0;
 }
 
 int scatter_stack_new(const struct scatter_images *images, const struct scatter_source *source,
@@ -40,6 +78,7 @@ int scatter_stack_new(const struct scatter_images *images, const struct scatter_
 {
 	const int most[2] = {images->columns, images->rows};
 	struct scatter_stack *stack;
+	bool lacks = false;
 
 	if (source == NULL || source->count == 0)
 		return error_set(err, ERR_IMPOSSIBLE, "no projection of the scan has an image of its scatter");
@@ -49,20 +88,17 @@ int scatter_stack_new(const struct scatter_images *images, const struct scatter_
 	stack->images = *images;
 	stack->source = source;
 	stack->image = malloc(scatter_image_bytes(images));
+	stack->spikes = calloc((size_t)source->count, sizeof(*stack->spikes));
 	for (int i = 0; i < 2; i++) {
 		stack->count[i] = blocks->count[i];
-		stack->along[i] = malloc((size_t)blocks->count[i] * sizeof(struct between));
 		stack->read[i].at = -1;
 		stack->read[i].image = malloc(scatter_image_bytes(images));
+		lacks |= place_pixels(stack, i, blocks, detector[i], most[i]) != 0 || stack->read[i].image == NULL;
 	}
-	if (stack->image == NULL || stack->along[0] == NULL || stack->along[1] == NULL ||
-	    stack->read[0].image == NULL || stack->read[1].image == NULL) {
+	if (lacks || stack->image == NULL || stack->spikes == NULL) {
 		scatter_stack_free(stack);
 		return error_set(err, ERR_NO_MEMORY, "no memory for images of %zu bytes", scatter_image_bytes(images));
 	}
-	for (int i = 0; i < 2; i++)
-		place_pixels(stack->along[i], blocks->count[i], blocks->first[i], blocks->size[i], detector[i],
-			     most[i]);
 	*ret_stack = stack;
 	return 0;
 }
@@ -73,9 +109,11 @@ void scatter_stack_free(struct scatter_stack *stack)
 		return;
 	for (int i = 0; i < 2; i++) {
 		free(stack->along[i]);
+		free(stack->shares[i]);
 		free(stack->read[i].image);
 	}
 	free(stack->image);
+	free(stack->spikes);
 	free(stack);
 }
 
@@ -88,6 +126,9 @@ static int read_image(struct scatter_stack *stack, int at, int other, const floa
 	if (stack->read[slot].at != at) {
 		stack->read[slot].at = -1;
 		code = stack->source->read(stack->source->context, at, stack->read[slot].image, err);
+		if (code == 0)
+			code = scatter_spikes_replace(stack->read[slot].image, stack->images.columns,
+						      stack->images.rows, &stack->spikes[at], err);
 	}
 	if (code == 0) {
 		stack->read[slot].at = at;
@@ -122,17 +163,38 @@ int scatter_stack_take(struct scatter_stack *stack, int projection, struct error
 
 void scatter_stack_row(const struct scatter_stack *stack, int row, float *ret_row)
 {
-	const struct between *at = &stack->along[1][row];
-	const float *above = stack->image + (size_t)at->first * (size_t)stack->images.columns;
-	const float *below = above + (stack->images.rows > 1 ? stack->images.columns : 0);
-	const int next = stack->images.columns > 1;
+	const struct parts *down = &stack->along[1][row];
+	const size_t columns = (size_t)stack->images.columns;
+	float line[SCATTER_IMAGE_MOST];
 
-	for (int i = 0; i < stack->count[0]; i++) {
-		const struct between *across = &stack->along[0][i];
-		const int c = across->first;
-		const float first = above[c] + across->share * (above[c + next] - above[c]);
-		const float second = below[c] + across->share * (below[c + next] - below[c]);
+	memset(line, 0, columns * sizeof(*line));
+	for (int k = 0; k < down->count; k++) {
+		const float *image = stack->image + (size_t)(down->first + k) * columns;
 
-		ret_row[i] = first + at->share * (second - first);
+		for (size_t c = 0; c < columns; c++)
+			line[c] += down->share[k] * image[c];
 	}
+	for (int i = 0; i < stack->count[0]; i++) {
+		const struct parts *across = &stack->along[0][i];
+		float sum = 0;
+
+		for (int k = 0; k < across->count; k++)
+			sum += across->share[k] * line[across->first + k];
+		ret_row[i] = sum;
+	}
+}
+
+size_t scatter_stack_spikes(const struct scatter_stack *stack, int *ret_images, int *ret_first)
+{
+	size_t spikes = 0;
+
+	*ret_images = 0;
+	*ret_first = -1;
+	for (int at = stack->source->count - 1; at >= 0; at--) {
+		spikes += stack->spikes[at];
+		*ret_images += stack->spikes[at] > 0;
+		if (stack->spikes[at] > 0)
+			*ret_first = stack->source->projections[at];
+	}
+	return spikes;
 }

@@ -8,8 +8,9 @@
 /*
  * Scattered radiation as somebody else has computed it: coarse images of some projections, each over all of the
  * detector. What lies between the centres of an image's pixels is bilinear, and beyond the outermost ones as they are;
- * a projection without an image of its own has what lies between those beside it, by its number, and one beyond the
- * first or the last of them has that one.
+ * a block of pixels has the mean of what its pixels have, as it has of their counts. Pixels that stand out from an
+ * image are replaced first (scatter_spikes.h). A projection without an image of its own has what lies between those
+ * beside it, by its number, and one beyond the first or the last of them has that one.
  */
 struct scatter_source {
 	void *context;
@@ -31,5 +32,9 @@ void scatter_stack_free(struct scatter_stack *stack); /* NULL is fine */
 int scatter_stack_take(struct scatter_stack *stack, int projection, struct error *err);
 /* The scatter in a row of it, counts. */
 void scatter_stack_row(const struct scatter_stack *stack, int row, float *ret_row);
+
+/* How many pixels were replaced in the images that were turned to so far, and in how many; ret_first: the first's
+ * number. */
+size_t scatter_stack_spikes(const struct scatter_stack *stack, int *ret_images, int *ret_first);
 
 #endif

@@ -13,8 +13,9 @@
 
 /* At least this share of a count is left: no model is so good that it could take more. */
 static const float KEPT_LEAST = 0.05f;
-/* Samples that are held at that share, from which on it is told. */
-static const double LIMITED_MANY = 0.01;
+/* Samples that are held at that share, from which on it is told, of an estimate and of images; and that the image may
+ * be wrong as a whole. */
+static const double LIMITED_MANY = 0.01, LIMITED_OF_IMAGES = 0.001, EXCEEDED = 0.03;
 /* Of the counts: images with less than that are in another unit than the projections. */
 static const double FAINT = 0.001;
 
@@ -228,11 +229,35 @@ static int take_out(const struct correction_job *job, void *context, int view, f
 	return 0;
 }
 
+/* Where scatter comes near the signal, or exceeds it: by one code or the other. */
+static void warn_of_limits(const struct correction_job *job, const struct state *state)
+{
+	const double held = (double)state->limited / ((double)job->input->pixels * state->views);
+
+	if (held > (state->images != NULL ? LIMITED_OF_IMAGES : LIMITED_MANY))
+		warning_tell(job->warnings, held > EXCEEDED ? "scatter_exceeds" : "scatter_limited",
+			     "the scatter leaves less than %.2g of the counts of %.3g %% of the samples, "
+			     "which were held there; it is %.3g %% of the counts on average, %.3g %% at most",
+			     (double)KEPT_LEAST, 100 * held, 100 * state->shares / state->views,
+			     100 * state->share_most);
+}
+
+static void warn_of_spikes(const struct correction_job *job, const struct scatter_stack *images)
+{
+	int count, first;
+	const size_t spikes = scatter_stack_spikes(images, &count, &first);
+
+	if (spikes > 0)
+		warning_tell(job->warnings, "scatter_spikes",
+			     "%zu pixels in %d images of scatter, the first of them projection %d's, are negative or "
+			     "stand out from those about them, and were replaced from these",
+			     spikes, count, first);
+}
+
 static int warn(const struct correction_job *job, void *context, struct error *err)
 {
 	const struct state *state = context;
 	const struct scatter_model *model = job->input->given.scatter;
-	const double samples = (double)job->input->pixels * state->views;
 
 	(void)err;
 	if (state->views == 0)
@@ -248,12 +273,9 @@ static int warn(const struct correction_job *job, void *context, struct error *e
 		    "the images of scatter are %.3g %% of the counts on average: are they in another unit than "
 		    "the projections' counts above the dark?",
 		    100 * state->shares / state->views);
-	if ((double)state->limited > LIMITED_MANY * samples)
-		warning_tell(job->warnings, "scatter_limited",
-			     "the scatter leaves less than %.2g of the counts of %.3g %% of the samples, "
-			     "which were held there; it is %.3g %% of the counts on average, %.3g %% at most",
-			     (double)KEPT_LEAST, 100 * (double)state->limited / samples,
-			     100 * state->shares / state->views, 100 * state->share_most);
+	warn_of_limits(job, state);
+	if (state->images != NULL)
+		warn_of_spikes(job, state->images);
 	return 0;
 }
 

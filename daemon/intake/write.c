@@ -244,10 +244,13 @@ static int process_scatter(struct slot *slot, struct error *err)
 	bool created;
 
 	for (int i = 0; i < images->columns * images->rows; i++)
-		if (!isfinite(pixels[i]))
-			return error_set(
-			    err, ERR_IMPOSSIBLE, "pixel (column %d, row %d) is %s; scatter must be finite counts",
-			    i % images->columns, i / images->columns, isnan(pixels[i]) ? "NaN" : "infinite");
+		if (!isfinite(pixels[i]) || pixels[i] < 0)
+			return error_set(err, ERR_IMPOSSIBLE,
+					 "pixel (column %d, row %d) is %s; scatter must be finite counts of at least 0",
+					 i % images->columns, i / images->columns,
+					 isnan(pixels[i])   ? "NaN"
+					 : isinf(pixels[i]) ? "infinite"
+							    : "negative");
 	if (store_put_scatter(slot->upload->scan, slot->index, pixels, &created, err) != 0)
 		return err->code;
 	slot->outcome = created ? SLOT_CREATED : SLOT_SAME;

@@ -124,6 +124,10 @@ test_an_image_comes_back_and_is_checked() {
 	req PUT "/v1/scans/$scan/scatter/20" --data-binary @"$work/nan.raw"
 	expect_problem 422
 	expect_json '.detail | contains("column 2, row 0")'
+	{ head -c 80 "$work/image.raw" && printf '\0\0\200\277' && tail -c +85 "$work/image.raw"; } >"$work/negative.raw"
+	req PUT "/v1/scans/$scan/scatter/20" --data-binary @"$work/negative.raw"
+	expect_problem 422
+	expect_json '.detail | contains("column 0, row 1) is negative")'
 	zstd -q -c "$work/image.raw" >"$work/image.zst"
 	req PUT "/v1/scans/$scan/scatter/20" -H 'Content-Encoding: zstd' --data-binary @"$work/image.zst"
 	expect_status 201
@@ -146,6 +150,45 @@ test_a_scan_that_is_broken_off_wants_the_images_of_its_views() {
 	put_image 30
 	expect_status 201
 	wait_job succeeded
+}
+
+# $1: which images, FROM TO; $2: what happens to their pixel 10, 8, or with "block" to four, or with "all" to all of them
+spoil() {
+	rm -rf "$work/spoiled"
+	cp -r "$work/images" "$work/spoiled"
+	/usr/bin/env python3 - "$work/spoiled/scatter.raw" "$@" <<'EOP'
+import array, sys
+path, first, last, where, factor = sys.argv[1], int(sys.argv[2]), int(sys.argv[3]), sys.argv[4], float(sys.argv[5])
+samples = array.array('f', open(path, 'rb').read())
+offsets = {'pixel': [8 * 20 + 10], 'block': [8 * 20 + 10, 8 * 20 + 11, 9 * 20 + 10, 9 * 20 + 11], 'all': range(320)}[where]
+for image in range(first, last + 1):
+    for at in offsets:
+        samples[320 * image + at] = min(3.4e38, samples[320 * image + at] * factor)
+samples.tofile(open(path, 'wb'))
+EOP
+}
+test_spikes_are_replaced_and_too_much_is_told() {
+	reconstruct_spoiled() {
+		scan=$(cbct upload --quiet --url "$url" "$work/spoiled") || fail "cbct upload"
+		post_job "$recipe"
+		wait_job succeeded
+	}
+	spikes_of() { # IMAGES PIXELS FROM TO WHERE FACTOR
+		spoil "${@:3}"
+		reconstruct_spoiled
+		expect_json '[.warnings[] | select(.code | startswith("scatter")) | [.code, .severity]] == [["scatter_spikes", "caution"]]'
+		expect_json "[.warnings[].detail | select(contains(\"$2 pixels in $1 images\"))] | length == 1"
+		expect_number "$(distance)" '<' 3 "RMSE in HU with $* in place of an image"
+	}
+	spikes_of 6 6 0 5 pixel 2
+	spikes_of 6 24 0 5 block 3
+	spikes_of 1 1 2 2 pixel 1e38
+	# five times the scatter is told, by one warning, as is far more than all there is
+	for factor in 5 1000; do
+		spoil 0 5 all $factor
+		reconstruct_spoiled
+		expect_json '[.warnings[] | select(.code | startswith("scatter")) | [.code, .severity]] == [["scatter_exceeds", "serious"]]'
+	done
 }
 
 test_scans_that_cannot_be_are_refused() {

@@ -506,6 +506,8 @@ export const strings = {
 	'The images of scattered radiation hardly show any: they may be in another unit, and gray values are off then.': 'Die Bilder der Streustrahlung zeigen kaum welche: Vielleicht haben sie eine andere Einheit, dann weichen Grauwerte ab.',
 	'Images of scattered radiation that the scan announces are not there yet: it waits for them.': 'Bilder der Streustrahlung, die der Scan ankündigt, sind noch nicht da: Er wartet darauf.',
 	'The correction for scattered radiation wanted to take nearly all of the signal in some places: gray values may be wrong there.': 'Die Streukorrektur wollte an einigen Stellen fast das ganze Signal abziehen: Grauwerte können dort falsch sein.',
+	'The scattered radiation given for this scan is more than was measured in many places: the image may be wrong.': 'Die angegebene Streustrahlung ist an vielen Stellen mehr, als gemessen wurde: Das Bild kann falsch sein.',
+	'Single pixels of the images of scattered radiation were wrong and were replaced from their neighbours.': 'Einzelne Pixel der Bilder der Streustrahlung waren falsch und wurden aus ihren Nachbarn ersetzt.',
 	'The value given for air is one at which the detector is saturated.': 'Beim angegebenen Wert für Luft ist der Detektor gesättigt.',
 	'The scan was broken off: the image is made of the projections that arrived.': 'Der Scan wurde abgebrochen: Das Bild ist aus den angekommenen Projektionen.',
 	'The scan lacks its flat image: nothing can be reconstructed before it arrives.': 'Dem Scan fehlt das Hellbild: Vorher kann nichts rekonstruiert werden.',
