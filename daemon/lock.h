@@ -16,6 +16,7 @@ enum lock_rank {
 	LOCK_EVENTS,     /* event_ring.lock */
 	LOCK_INSERTION,  /* store.insertion_lock */
 	LOCK_CATALOGUE,  /* catalogue.locks[] */
+	LOCK_SCATTER,    /* stored_scan.scatter_files */
 	LOCK_SCANS,      /* store.scans_lock */
 	LOCK_SCAN,       /* stored_scan.lock */
 	LOCK_JOBS,       /* jobs.lock */

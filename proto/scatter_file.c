@@ -8,6 +8,7 @@
 #include <sys/stat.h>
 #include <unistd.h>
 
+#include "proto/durable.h"
 #include "proto/scan_directory.h"
 
 static int open_samples(const char *directory, int flags, int *ret_file, struct error *err)
@@ -23,20 +24,50 @@ static int open_samples(const char *directory, int flags, int *ret_file, struct 
 	return *ret_file < 0 ? error_set_errno(err, errno, "%s cannot be opened", path) : 0;
 }
 
-int scatter_file_create(const char *directory, const struct scatter_images *images, int projections, struct error *err)
+/* The samples' file with its full size, durably; *ret_mended is set where it had not. */
+static int make_samples(const char *directory, const struct scatter_images *images, int count, bool *ret_mended,
+			struct error *err)
 {
-	const int count = scatter_images_count(images, projections);
-	const size_t bytes = scatter_image_bytes(images);
+	const off_t size = (off_t)scatter_image_bytes(images) * count;
+	struct stat status;
 	int file, code = open_samples(directory, O_RDWR | O_CREAT, &file, err);
 
 	if (code != 0)
 		return code;
-	if (ftruncate(file, (off_t)(bytes * (size_t)count)) != 0)
+	if (fstat(file, &status) != 0)
+		code = error_set_errno(err, errno, SCATTER_FILE);
+	else if (status.st_size == size)
+		goto out;
+	else if (ftruncate(file, size) != 0)
 		code = error_set_errno(err, errno == EFBIG ? ENOSPC : errno, "file for %d images of scatter", count);
 	else if (fsync(file) != 0)
 		code = error_set_sync(err, errno, "sync " SCATTER_FILE);
+	*ret_mended = true;
+out:
 	close(file);
-	return code == 0 ? sums_create_file(directory, SUMS_SCATTER_FILE, count, bytes, err) : code;
+	return code;
+}
+
+int scatter_file_create(const char *directory, const struct scatter_images *images, int projections, struct error *err)
+{
+	const int count = scatter_images_count(images, projections);
+	const struct sum never = {.bytes = 0};
+	bool mended;
+	int code = make_samples(directory, images, count, &mended, err);
+
+	return code == 0
+		   ? sums_create_file(directory, SUMS_SCATTER_FILE, count, scatter_image_bytes(images), &never, err)
+		   : code;
+}
+
+static int look_for_mark(struct scatter_file *file, bool whole, struct error *err)
+{
+	unsigned char state = SUM_NONE;
+	struct sum sum;
+	int code = sums_get(file->sums, SUMS_SCAN, 1, 0, &sum, &state, err);
+
+	file->marked = !whole || state != SUM_NONE;
+	return code;
 }
 
 int scatter_file_open(const char *directory, const struct scatter_images *images, int projections, bool writing,
@@ -65,6 +96,8 @@ int scatter_file_open(const char *directory, const struct scatter_images *images
 			file.sums = -1;
 		else if (got != 0)
 			code = got, *err = why;
+		else
+			code = look_for_mark(&file, *ret_whole, err);
 	}
 	if (code != 0)
 		scatter_file_close(&file);
@@ -80,6 +113,31 @@ void scatter_file_close(struct scatter_file *file)
 	if (file->count > 0 && file->sums >= 0)
 		close(file->sums);
 	*file = (struct scatter_file){.samples = -1, .sums = -1};
+}
+
+static enum scatter_state state_of(const struct scatter_file *file, enum sum_state state, const struct sum *sum)
+{
+	if (state == SUM_NONE)
+		return file->marked ? SCATTER_LOST : SCATTER_NONE;
+	if (state == SUM_DAMAGED || sum->lost)
+		return SCATTER_LOST;
+	if (sum->bytes == 0)
+		return SCATTER_NONE;
+	return sum->bytes == scatter_image_bytes(&file->images) ? SCATTER_STORED : SCATTER_LOST;
+}
+
+int scatter_file_states(const struct scatter_file *file, unsigned char *ret_states, struct error *err)
+{
+	int code = 0;
+
+	for (int i = 0; i < file->count && code == 0; i++) {
+		unsigned char state = SUM_NONE;
+		struct sum sum;
+
+		code = sums_get(file->sums, i, 1, 0, &sum, &state, err);
+		ret_states[i] = (unsigned char)state_of(file, state, &sum);
+	}
+	return code;
 }
 
 static int damaged(const struct scatter_file *file, int image, struct error *err)
@@ -144,4 +202,90 @@ int scatter_file_lose(const struct scatter_file *file, int image, struct error *
 
 	sum.lost = true;
 	return code == 0 ? put_record(file, image, &sum, err) : code;
+}
+
+/* ---- files that are not whole ---- */
+
+/* Into new records, in which all images are lost so far: those of the old file that are good, and images that never
+ * came. */
+static int copy_records(const struct scatter_file *from, const struct scatter_file *to, const unsigned char *states,
+			struct error *err)
+{
+	const struct sum never = {.bytes = 0};
+	int code = 0;
+
+	for (int i = 0; i < to->count && code == 0; i++) {
+		unsigned char state = SUM_NONE;
+		struct sum sum = never;
+
+		if (from->sums >= 0)
+			code = sums_get(from->sums, i, 1, 0, &sum, &state, err);
+		if (code != 0)
+			break;
+		if (state_of(from, state, &sum) != SCATTER_LOST)
+			code = sums_put(to->sums, i, &sum, err);
+		else if (states != NULL && states[i] == SCATTER_NONE)
+			code = sums_put(to->sums, i, &never, err);
+	}
+	if (code == 0 && fdatasync(to->sums) != 0)
+		code = error_set_sync(err, errno, "sync " SUMS_SCATTER_FILE);
+	return code;
+}
+
+static int make_records(const char *directory, const struct scatter_file *from, const unsigned char *states,
+			struct error *err)
+{
+	const struct sum lost = {.lost = true};
+	struct scatter_file to;
+	bool whole;
+	int code =
+	    sums_create_file(directory, SUMS_SCATTER_FILE, from->count, scatter_image_bytes(&from->images), &lost, err);
+
+	if (code == 0)
+		code = scatter_file_open(directory, &from->images, from->projections, true, &to, &whole, err);
+	if (code != 0)
+		return code;
+	code = to.sums < 0 ? error_set(err, ERR_IO, "there is no " SUMS_SCATTER_FILE)
+			   : copy_records(from, &to, states, err);
+	scatter_file_close(&to);
+	return code;
+}
+
+int scatter_file_mend(const char *directory, const struct scatter_images *images, int projections,
+		      const unsigned char *states, bool *ret_mended, struct error *err)
+{
+	struct scatter_file file;
+	char path[PATH_MAX];
+	struct error why;
+	bool whole = false;
+	int code;
+
+	*ret_mended = false;
+	code = path_join(path, sizeof(path), directory, SCATTER_FILE, "", err);
+	if (code == 0)
+		code = make_samples(directory, images, scatter_images_count(images, projections), ret_mended, err);
+	if (code == 0 && *ret_mended)
+		code = durable_sync_names(path, err);
+	if (code != 0)
+		return code;
+	code = scatter_file_open(directory, images, projections, false, &file, &whole, &why);
+	if (code == ERR_INVALID) { /* another scan's records: as if there were none */
+		file = (struct scatter_file){.images = *images,
+					     .projections = projections,
+					     .count = scatter_images_count(images, projections),
+					     .samples = -1,
+					     .sums = -1,
+					     .marked = true};
+	} else if (code != 0) {
+		*err = why;
+		return code;
+	}
+	file.marked |= file.sums < 0;
+	code = 0;
+	if (file.sums < 0 || !whole) {
+		*ret_mended = true;
+		code = make_records(directory, &file, states, err);
+	}
+	scatter_file_close(&file);
+	return code;
 }

@@ -136,12 +136,18 @@ static void write_line(int count, size_t projection_bytes, char ret_line[SUMS_RE
 	memcpy(ret_line + SUMS_RECORD_BYTES - 9, text, 9);
 }
 
-static size_t file_bytes(int count)
+static off_t offset_of(int slot)
 {
-	return SUMS_FIRST + (size_t)SUMS_RECORD_BYTES * (size_t)count;
+	return SUMS_FIRST + (off_t)SUMS_RECORD_BYTES * slot;
 }
 
-int sums_create_file(const char *directory, const char *name, int count, size_t each, struct error *err)
+static size_t file_bytes(int count)
+{
+	return (size_t)offset_of(count);
+}
+
+int sums_create_file(const char *directory, const char *name, int count, size_t each, const struct sum *first,
+		     struct error *err)
 {
 	/* Zeros that are written, not set aside: each later sync finds its blocks in place. */
 	char path[PATH_MAX], *bytes = calloc(1, file_bytes(count));
@@ -150,6 +156,8 @@ int sums_create_file(const char *directory, const char *name, int count, size_t 
 
 	if (code == 0) {
 		write_line(count, each, bytes);
+		for (int slot = SUMS_SCAN; first != NULL && slot < count; slot = slot < 0 ? 0 : slot + 1)
+			sum_pack(first, slot, (uint8_t *)bytes + offset_of(slot));
 		code = file_write_durable(path, bytes, file_bytes(count), err);
 	}
 	free(bytes);
@@ -158,7 +166,7 @@ int sums_create_file(const char *directory, const char *name, int count, size_t 
 
 int sums_create(const char *directory, int count, size_t projection_bytes, struct error *err)
 {
-	return sums_create_file(directory, SUMS_FILE, count, projection_bytes, err);
+	return sums_create_file(directory, SUMS_FILE, count, projection_bytes, NULL, err);
 }
 
 /* Whether this line is a good one, though of other numbers. */
@@ -211,11 +219,6 @@ int sums_open(const char *directory, bool writing, int count, size_t projection_
 	      struct error *err)
 {
 	return sums_open_file(directory, SUMS_FILE, writing, count, projection_bytes, ret_file, ret_whole, err);
-}
-
-static off_t offset_of(int slot)
-{
-	return SUMS_FIRST + (off_t)SUMS_RECORD_BYTES * slot;
 }
 
 int sums_put(int file, int slot, const struct sum *sum, struct error *err)

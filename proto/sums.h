@@ -27,7 +27,7 @@
  * Any thread; one writer of a record at a time.
  */
 #define SUMS_FILE "projections.sums"
-#define SUMS_SCATTER_FILE "scatter.sums" /* of images of scatter, proto/scatter_file.h; it has no parts */
+#define SUMS_SCATTER_FILE "scatter.sums" /* of images of scatter, proto/scatter_file.h; it has no parts but a mark */
 
 enum { SUMS_RECORD_BYTES = 64, SUMS_FIRST = 512 };
 
@@ -56,7 +56,9 @@ uint32_t checksum_join(uint32_t before, uint32_t after, size_t bytes);
 
 /* The file with all records blank, durably; one that was there is replaced. */
 int sums_create(const char *directory, int count, size_t projection_bytes, struct error *err);
-int sums_create_file(const char *directory, const char *name, int count, size_t each, struct error *err);
+/* first: the record of each of them, and of slot SUMS_SCAN; NULL: a blank one. */
+int sums_create_file(const char *directory, const char *name, int count, size_t each, const struct sum *first,
+		     struct error *err);
 /*
  * A descriptor, the caller's to close. ERR_NOT_FOUND where there is no file, ERR_INVALID where it is another scan's. A
  * line that is damaged is passed over (*ret_whole false, as when the file is too short): the records check themselves.

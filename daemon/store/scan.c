@@ -40,6 +40,7 @@ struct stored_scan *stored_scan_free(struct stored_scan *scan)
 	free(scan->sums);
 	watch_list_destroy(&scan->watchers);
 	pthread_mutex_destroy(&scan->lock);
+	pthread_mutex_destroy(&scan->scatter_files);
 	free(scan);
 	return NULL;
 }
@@ -51,6 +52,7 @@ struct stored_scan *stored_scan_new(struct store *store, int count)
 	if (scan == NULL)
 		return NULL;
 	lock_init(&scan->lock, LOCK_SCAN);
+	lock_init(&scan->scatter_files, LOCK_SCATTER);
 	watch_list_init(&scan->watchers);
 	scan->store = store;
 	scan->count = count;

@@ -52,8 +52,9 @@ struct stored_scan {
 	struct scatter_images scatter;
 	int scatter_count;
 	unsigned char *scatter_progress, *scatter_lost;
-	bool document_damaged; /* scan.json */
-	bool suspect;          /* all of its files are to be checked before it is used (store/sums.c) */
+	pthread_mutex_t scatter_files; /* held over each writing to the files of those images, and over their mend */
+	bool document_damaged;         /* scan.json */
+	bool suspect;                  /* all of its files are to be checked before it is used (store/sums.c) */
 	bool pinned;
 	bool deleted; /* written in a group of the catalogue too, as the next */
 	bool closing; /* takes no new projections */
@@ -103,8 +104,9 @@ void stored_scan_add(struct stored_scan *scan, int index, const struct sum *sum)
 int store_load_sums(struct store *store, struct stored_scan *scan, struct error *err);
 
 /*
- * Images of scatter, store/scatter.c: their lists in memory; their files; what is there, from their records. Then, with
- * the scan's lock held, whether those are there that a projection needs, and how many there are; all of them are read.
+ * Images of scatter, store/scatter.c: their lists in memory; their files; what is there, from their records, where
+ * files that are not whole are made again. Then, with the scan's lock held, whether those are there that a projection
+ * needs, and how many there are; all of them are read.
  */
 int stored_scan_set_scatter(struct stored_scan *scan, const struct scatter_images *images, struct error *err);
 int store_make_scatter(const struct stored_scan *scan, const char *directory, struct error *err);

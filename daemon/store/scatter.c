@@ -38,55 +38,6 @@ int stored_scan_set_scatter(struct stored_scan *scan, const struct scatter_image
 	return 0;
 }
 
-/* ---- at the start ---- */
-
-static int load_records(struct stored_scan *scan, const struct scatter_file *file, struct error *err)
-{
-	int code = 0;
-
-	for (int i = 0; i < scan->scatter_count && code == 0; i++) {
-		unsigned char state = SUM_NONE;
-		struct sum sum = {.lost = false};
-
-		code = file->sums < 0
-			   ? 0
-			   : sums_get(file->sums, i, 1, scatter_image_bytes(&scan->scatter), &sum, &state, err);
-		scan->scatter_lost[i] = state == SUM_DAMAGED || (state == SUM_GOOD && sum.lost);
-		scan->scatter_progress[i] = state == SUM_GOOD && !sum.lost ? STORED : MISSING;
-	}
-	return code;
-}
-
-int store_load_scatter(struct stored_scan *scan, struct error *err)
-{
-	struct scatter_file file;
-	char directory[1024];
-	bool whole;
-	int code;
-
-	if (scan->scatter_count == 0 || scan->gone)
-		return 0;
-	code = open_file(scan, false, &file, &whole, err);
-	if (code == 0) {
-		const bool listed = file.sums >= 0;
-
-		code = load_records(scan, &file, err);
-		scatter_file_close(&file);
-		if (code != 0 || listed)
-			return code;
-	}
-	if (code != 0 && code != ERR_NOT_FOUND && code != ERR_INVALID)
-		return code;
-	log_line(LEVEL_ERROR,
-		 "scan %s: its images of scatter are not there with their checksums: they are missing until they "
-		 "are sent again",
-		 scan->id);
-	memset(scan->scatter_progress, MISSING, (size_t)scan->scatter_count);
-	memset(scan->scatter_lost, 1, (size_t)scan->scatter_count);
-	store_scan_directory(scan->store, scan->id, directory);
-	return store_make_scatter(scan, directory, err);
-}
-
 /* ---- what is there ---- */
 
 /* The image is one that the scan's views need; with the scan's lock held. */
@@ -133,78 +84,259 @@ void stored_scan_received_scatter(struct stored_scan *scan, unsigned char *ret_f
 	pthread_mutex_unlock(&scan->lock);
 }
 
-/* ---- in and out ---- */
+/* ---- files that are not whole ---- */
 
-/* The disk has damaged the image: it is missing again. */
-static void lose(struct stored_scan *scan, int image)
+/* In memory what the records say; an image that somebody is writing just now is left to them. Returns how many that
+ * were stored are not any more. */
+static int follow_records(struct stored_scan *scan, const unsigned char *states)
+{
+	int lost = 0;
+
+	pthread_mutex_lock(&scan->lock);
+	for (int i = 0; i < scan->scatter_count; i++) {
+		if (scan->scatter_progress[i] == CLAIMED)
+			continue;
+		lost += scan->scatter_progress[i] == STORED && states[i] != SCATTER_STORED;
+		scan->scatter_progress[i] = states[i] == SCATTER_STORED ? STORED : MISSING;
+		scan->scatter_lost[i] = states[i] == SCATTER_LOST;
+	}
+	scan->losses += (unsigned)lost;
+	pthread_mutex_unlock(&scan->lock);
+	return lost;
+}
+
+static int read_states(struct stored_scan *scan, unsigned char *ret_states, struct error *err)
 {
 	struct scatter_file file;
-	struct error err;
-	bool whole, lost;
-	int code;
+	bool whole;
+	int code = open_file(scan, false, &file, &whole, err);
+
+	if (code != 0)
+		return code;
+	code = file.sums < 0 ? error_set(err, ERR_DAMAGED, "there is no " SUMS_SCATTER_FILE)
+			     : scatter_file_states(&file, ret_states, err);
+	scatter_file_close(&file);
+	return code;
+}
+
+/* What is known in memory of images whose records are gone; at the start that is nothing. */
+static void known_states(struct stored_scan *scan, unsigned char *ret_states)
+{
+	pthread_mutex_lock(&scan->lock);
+	for (int i = 0; i < scan->scatter_count; i++)
+		ret_states[i] =
+		    scan->scatter_progress[i] == MISSING && !scan->scatter_lost[i] ? SCATTER_NONE : SCATTER_LOST;
+	pthread_mutex_unlock(&scan->lock);
+}
+
+/* The files are made whole again where they are not, with what is left of them; memory follows. *ret_mended: they were
+ * not. */
+static int mend(struct stored_scan *scan, bool known, bool *ret_mended, struct error *err)
+{
+	unsigned char *states = malloc((size_t)scan->scatter_count);
+	char directory[1024];
+	int code, lost = 0;
+
+	if (states == NULL)
+		return error_set_errno(err, ENOMEM, "list of %d images", scan->scatter_count);
+	store_scan_directory(scan->store, scan->id, directory);
+	pthread_mutex_lock(&scan->scatter_files);
+	known_states(scan, states);
+	code = scatter_file_mend(directory, &scan->scatter, scan->count, known ? states : NULL, ret_mended, err);
+	if (code == 0)
+		code = read_states(scan, states, err);
+	if (code == 0)
+		lost = follow_records(scan, states);
+	pthread_mutex_unlock(&scan->scatter_files);
+	free(states);
+	if (*ret_mended)
+		log_line(LEVEL_ERROR,
+			 "scan %s: its images of scatter are not all there with their checksums: what is damaged is "
+			 "missing until it is sent again",
+			 scan->id);
+	if (lost > 0) {
+		watch_wake(&scan->watchers);
+		watch_wake(&scan->store->arrivals);
+	}
+	return code;
+}
+
+/* ---- damage ---- */
+
+static bool are_not_whole(int code)
+{
+	return code == ERR_NOT_FOUND || code == ERR_INVALID;
+}
+
+/* ERR_DAMAGED: the image does not fit its record; another code that are_not_whole knows: the files are not whole. */
+static int read_image(struct stored_scan *scan, int image, float *ret_pixels, struct sum *ret_sum, struct error *err)
+{
+	struct scatter_file file;
+	bool whole;
+	int code = open_file(scan, false, &file, &whole, err);
+
+	if (code != 0)
+		return code;
+	if (file.sums < 0 || !whole)
+		code = error_set(err, ERR_NOT_FOUND, SUMS_SCATTER_FILE " is not whole");
+	else if (scatter_file_read(&file, image, ret_pixels, ret_sum, err) != 0)
+		code = err->code == ERR_NO_MEMORY ? ERR_NO_MEMORY : ERR_DAMAGED;
+	scatter_file_close(&file);
+	return code;
+}
+
+static bool is_stored(struct stored_scan *scan, int image, bool *ret_lost)
+{
+	bool stored;
 
 	pthread_mutex_lock(&scan->lock);
-	lost = scan->scatter_progress[image] == STORED;
-	if (lost) {
-		scan->scatter_progress[image] = CLAIMED;
-		scan->scatter_lost[image] = 1;
-		scan->losses++;
-	}
+	stored = scan->scatter_progress[image] == STORED;
+	*ret_lost = scan->scatter_lost[image] != 0;
 	pthread_mutex_unlock(&scan->lock);
-	if (!lost)
-		return;
-	code = open_file(scan, true, &file, &whole, &err);
-	if (code == 0) {
-		code = scatter_file_lose(&file, image, &err);
-		scatter_file_close(&file);
-	}
-	if (code != 0)
-		log_line(LEVEL_WARNING, "scan %s: damage cannot be noted: %s", scan->id, err.text);
-	log_line(LEVEL_ERROR,
-		 "scan %s: an image of its scatter is damaged on the disk: its jobs wait until it is sent again",
-		 scan->id);
+	return stored;
+}
+
+static void set_progress(struct stored_scan *scan, int image, enum progress progress)
+{
 	pthread_mutex_lock(&scan->lock);
-	scan->scatter_progress[image] = MISSING;
+	scan->scatter_progress[image] = progress;
+	if (progress == STORED)
+		scan->scatter_lost[image] = 0;
 	pthread_mutex_unlock(&scan->lock);
 	watch_wake(&scan->watchers);
 	watch_wake(&scan->store->arrivals);
 }
 
-int store_read_scatter(struct stored_scan *scan, int image, float *ret_pixels, struct sum *ret_sum, struct error *err)
+static void note_lost(struct stored_scan *scan, int image)
 {
 	struct scatter_file file;
-	bool whole, stored;
+	struct error err;
+	bool whole;
 	int code;
 
-	pthread_mutex_lock(&scan->lock);
-	stored = scan->scatter_progress[image] == STORED;
-	pthread_mutex_unlock(&scan->lock);
-	if (!stored)
-		return error_set(err, ERR_NOT_FOUND, "the image of projection %d's scatter has not been stored yet",
-				 scatter_image_projection(&scan->scatter, scan->count, image));
-	code = open_file(scan, false, &file, &whole, err);
+	pthread_mutex_lock(&scan->scatter_files);
+	code = open_file(scan, true, &file, &whole, &err);
 	if (code == 0) {
-		code = file.sums < 0 ? error_set(err, ERR_DAMAGED, "there is no " SUMS_SCATTER_FILE)
-				     : scatter_file_read(&file, image, ret_pixels, ret_sum, err);
+		code = file.sums < 0 ? error_set(&err, ERR_IO, "there is no " SUMS_SCATTER_FILE)
+				     : scatter_file_lose(&file, image, &err);
 		scatter_file_close(&file);
 	}
-	if (code == ERR_NO_MEMORY || code == 0)
+	pthread_mutex_unlock(&scan->scatter_files);
+	if (code != 0)
+		log_line(LEVEL_WARNING, "scan %s: damage cannot be noted: %s", scan->id, err.text);
+	log_line(LEVEL_ERROR,
+		 "scan %s: the image of projection %d's scatter is damaged on the disk: it is missing until it is sent "
+		 "again",
+		 scan->id, scatter_image_projection(&scan->scatter, scan->count, image));
+}
+
+/* The image was found damaged: it is missing again, unless it was sent again since. */
+static void lose(struct stored_scan *scan, int image, float *buffer)
+{
+	struct error ignored;
+	struct sum sum;
+	bool lost;
+
+	pthread_mutex_lock(&scan->lock);
+	lost = scan->scatter_progress[image] == STORED;
+	if (lost)
+		scan->scatter_progress[image] = CLAIMED;
+	pthread_mutex_unlock(&scan->lock);
+	if (!lost)
+		return;
+	if (read_image(scan, image, buffer, &sum, &ignored) == 0) {
+		set_progress(scan, image, STORED);
+		return;
+	}
+	pthread_mutex_lock(&scan->lock);
+	scan->scatter_lost[image] = 1;
+	scan->losses++;
+	pthread_mutex_unlock(&scan->lock);
+	note_lost(scan, image);
+	set_progress(scan, image, MISSING);
+}
+
+/* Reads all that are stored; those that are damaged are lost behind this. */
+static void check_images(struct stored_scan *scan)
+{
+	float *pixels = malloc(scatter_image_bytes(&scan->scatter));
+	struct error ignored;
+	struct sum sum;
+	bool lost;
+	int code;
+
+	for (int i = 0; pixels != NULL && i < scan->scatter_count; i++) {
+		code = is_stored(scan, i, &lost) ? read_image(scan, i, pixels, &sum, &ignored) : 0;
+		if (code == ERR_DAMAGED || are_not_whole(code))
+			lose(scan, i, pixels);
+	}
+	free(pixels);
+}
+
+/* The files are whole behind this, and what of them is damaged is lost. */
+static int mend_and_check(struct stored_scan *scan, struct error *err)
+{
+	bool mended = false;
+	int code = stored_scan_deleted(scan) ? error_set(err, ERR_NOT_FOUND, "scan %s was deleted meanwhile", scan->id)
+					     : mend(scan, true, &mended, err);
+
+	if (code == 0 && mended)
+		check_images(scan);
+	return code;
+}
+
+int store_load_scatter(struct stored_scan *scan, struct error *err)
+{
+	bool mended = false;
+	int code;
+
+	if (scan->scatter_count == 0 || scan->gone)
+		return 0;
+	code = mend(scan, false, &mended, err);
+	if (code == 0 && mended)
+		check_images(scan);
+	if (code == 0 || code == ERR_NO_MEMORY)
 		return code;
-	lose(scan, image);
+	log_line(LEVEL_ERROR, "scan %s: its images of scatter cannot be had: %s", scan->id, err->text);
+	memset(scan->scatter_lost, 1, (size_t)scan->scatter_count);
+	return 0;
+}
+
+/* ---- in and out ---- */
+
+int store_read_scatter(struct stored_scan *scan, int image, float *ret_pixels, struct sum *ret_sum, struct error *err)
+{
+	const int projection = scatter_image_projection(&scan->scatter, scan->count, image);
+	bool lost;
+	int code;
+
+	if (!is_stored(scan, image, &lost))
+		return lost ? error_set(err, ERR_NOT_FOUND,
+					"the image of projection %d's scatter was damaged on the disk: it is missing "
+					"until it is sent again",
+					projection)
+			    : error_set(err, ERR_NOT_FOUND,
+					"the image of projection %d's scatter has not been stored yet", projection);
+	code = read_image(scan, image, ret_pixels, ret_sum, err);
+	if (are_not_whole(code) && mend_and_check(scan, err) == 0)
+		code = read_image(scan, image, ret_pixels, ret_sum, err);
+	if (code != ERR_DAMAGED && !are_not_whole(code))
+		return code;
+	lose(scan, image, ret_pixels);
 	return error_set(err, ERR_DAMAGED,
 			 "the image of projection %d's scatter is damaged on the disk: it is to be sent again",
-			 scatter_image_projection(&scan->scatter, scan->count, image));
+			 projection);
 }
 
 void store_check_scatter(struct stored_scan *scan)
 {
-	float *pixels = scan->scatter_count > 0 ? malloc(scatter_image_bytes(&scan->scatter)) : NULL;
-	struct error ignored;
-	struct sum sum;
+	struct error err;
 
-	for (int i = 0; pixels != NULL && i < scan->scatter_count; i++)
-		store_read_scatter(scan, i, pixels, &sum, &ignored); /* notes damage itself */
-	free(pixels);
+	if (scan->scatter_count == 0 || scan->gone)
+		return;
+	if (mend_and_check(scan, &err) != 0)
+		log_line(LEVEL_WARNING, "scan %s: its images of scatter cannot be made whole: %s", scan->id, err.text);
+	check_images(scan);
 }
 
 /* Nobody else writes this image until its progress is set again; *ret_there: it is stored. */
@@ -243,19 +375,48 @@ static int compare(struct stored_scan *scan, int image, const float *pixels, boo
 	return *ret_lost ? 0 : code;
 }
 
-static int write_claimed(struct stored_scan *scan, int image, const float *pixels, struct error *err)
+/* ERR_QUOTA: the image, which is counted already, goes beyond a limit. */
+static int check_room(struct stored_scan *scan, int image, struct error *err)
+{
+	int code = store_check_bytes(scan->store, scan->client, 0, err);
+
+	if (code != 0)
+		error_set(err, code, "the image of projection %d's scatter of %zu bytes goes beyond a limit of bytes",
+			  scatter_image_projection(&scan->scatter, scan->count, image),
+			  scatter_image_bytes(&scan->scatter));
+	return code;
+}
+
+/* A code that are_not_whole knows: nothing is written. */
+static int write_image(struct stored_scan *scan, int image, const float *pixels, struct error *err)
 {
 	struct scatter_file file;
 	bool whole;
-	int code = store_check_bytes(scan->store, scan->client, 0, err); /* it is counted already */
+	int code;
 
-	if (code == 0)
-		code = open_file(scan, true, &file, &whole, err);
+	pthread_mutex_lock(&scan->scatter_files);
+	code = open_file(scan, true, &file, &whole, err);
+	if (code == 0) {
+		code = file.sums < 0 || !whole ? error_set(err, ERR_NOT_FOUND, SUMS_SCATTER_FILE " is not whole")
+					       : scatter_file_write(&file, image, pixels, err);
+		scatter_file_close(&file);
+	}
+	pthread_mutex_unlock(&scan->scatter_files);
+	return code;
+}
+
+static int write_claimed(struct stored_scan *scan, int image, const float *pixels, struct error *err)
+{
+	int code = check_room(scan, image, err);
+
 	if (code != 0)
 		return code;
-	code = file.sums < 0 ? error_set(err, ERR_IO, "there is no " SUMS_SCATTER_FILE)
-			     : scatter_file_write(&file, image, pixels, err);
-	scatter_file_close(&file);
+	code = write_image(scan, image, pixels, err);
+	if (are_not_whole(code)) {
+		code = mend_and_check(scan, err);
+		if (code == 0)
+			code = write_image(scan, image, pixels, err);
+	}
 	if (code != 0)
 		store_distrust(scan->store, err);
 	return code;
@@ -276,14 +437,11 @@ int store_put_scatter(struct stored_scan *scan, int image, const float *pixels, 
 	if (code != 0 || there)
 		return code;
 	code = write_claimed(scan, image, pixels, err);
-	pthread_mutex_lock(&scan->lock);
-	scan->scatter_progress[image] = code == 0 ? STORED : MISSING;
 	if (code == 0) {
-		scan->scatter_lost[image] = 0;
+		pthread_mutex_lock(&scan->lock);
 		scan->arrived = clock_monotonic();
+		pthread_mutex_unlock(&scan->lock);
 	}
-	pthread_mutex_unlock(&scan->lock);
-	watch_wake(&scan->watchers);
-	watch_wake(&scan->store->arrivals);
+	set_progress(scan, image, code == 0 ? STORED : MISSING);
 	return code;
 }

@@ -205,6 +205,69 @@ test_scans_that_cannot_be_are_refused() {
 	refuse 400 /projections/scatter either '{"kind": "images", "columns": 4, "rows": 4, "fraction": 0.2}'
 }
 
+expect_damage() { # N: how many images the disk has damaged
+	req GET "/v1/scans/$scan"
+	expect_json "[.warnings[] | select(.code == \"damaged_image\") | [.severity, (.detail | contains(\"damaged $1 images of scatter\"))]] == [[\"serious\", true]]"
+}
+# Damage to a file of the images: NAME HOW
+damage() {
+	local file="$state/scans/$scan/$1"
+	case $2 in
+	zero) head -c "$(stat -c %s "$file")" /dev/zero >"$work/zeros" && cat "$work/zeros" >"$file" ;;
+	cut) truncate -s $(($(stat -c %s "$file") / 2)) "$file" ;;
+	longer) echo more >>"$file" ;;
+	gone) rm "$file" ;;
+	flip) printf '\377\377' | dd of="$file" bs=1 seek=700 conv=notrunc status=none ;;
+	esac
+}
+test_damage_under_the_running_daemon_is_told_and_healed() {
+	local first k how
+	scan=$(cbct upload --quiet --url "$url" "$work/images")
+	post_job "$recipe"
+	wait_job succeeded
+	first=$(digest)
+	# a job comes first: it waits, says for what, and has the same bits once the images were sent again
+	for how in 'raw zero' 'raw gone' 'sums zero' 'raw flip'; do
+		damage scatter.${how% *} "${how#* }"
+		post_job "$recipe"
+		waits_for_scatter
+		case $how in
+		'raw flip') expect_damage 1 ;;
+		*) expect_damage 6 ;;
+		esac
+		req GET "/v1/scans/$scan/scatter/0"
+		expect_problem 404
+		expect_json '.detail | contains("damaged on the disk")'
+		for k in 0 10 20 30 40 44; do put_image $k && expect_status "$(if [ "$how" = 'raw flip' ] && [ $k != 0 ]; then echo 200; else echo 201; fi)"; done
+		req GET "/v1/scans/$scan"
+		expect_json '[.warnings[].code] | index("damaged_image") == null'
+		wait_job succeeded
+		[ "$(digest)" = "$first" ] || fail "the same bits once what was damaged ($how) was sent again"
+	done
+	# and an image comes first, or who asks for one
+	for how in 'raw cut' 'raw longer' 'sums cut' 'sums gone' 'sums flip'; do
+		damage scatter.${how% *} "${how#* }"
+		if [ "${how#* }" = cut ]; then
+			req GET "/v1/scans/$scan/scatter/44"
+			expect_problem 500
+		fi
+		for k in 44 0 10 20 30 40; do put_image $k && jq -e '.stored + .same == 1' "$body" >/dev/null || fail "$how: an image that is sent again"; done
+		post_job "$recipe"
+		wait_job succeeded
+		[ "$(digest)" = "$first" ] || fail "the same bits ($how)"
+	done
+	# images that never came are not told as damaged, also where the list of all of them is gone
+	post_scan "$work/images"
+	put_image 10
+	damage scatter.sums gone
+	put_image 20
+	expect_status 201
+	expect_damage 1
+	req GET "/v1/scans/$scan/scatter/30"
+	expect_problem 404
+	expect_json '.detail | contains("not been stored yet")'
+}
+
 # The last one: the daemon that it starts has another port.
 test_what_was_stored_outlives_a_kill_and_damage_is_found() {
 	local first k
@@ -235,8 +298,22 @@ test_what_was_stored_outlives_a_kill_and_damage_is_found() {
 	stop_daemon
 	rm "$state/scans/$scan/scatter.sums"
 	start_daemon
-	req GET "/v1/scans/$scan"
+	expect_damage 6
 	expect_json '.scatter.missing == [0, 10, 20, 30, 40, 44]'
+	# that stays so, and so it is where they are zeros, all of them or one
+	stop_daemon
+	start_daemon
+	expect_damage 6
+	for k in 0 10 20 30 40 44; do put_image $k && expect_status 201; done
+	stop_daemon
+	head -c 64 /dev/zero | dd of="$state/scans/$scan/scatter.sums" bs=64 seek=9 conv=notrunc status=none
+	start_daemon
+	expect_damage 1
+	expect_json '.scatter.missing == [10]'
+	stop_daemon
+	damage scatter.sums zero
+	start_daemon
+	expect_damage 6
 	for k in 0 10 20 30 40 44; do put_image $k && expect_status 201; done
 	post_job "$recipe"
 	wait_job succeeded
