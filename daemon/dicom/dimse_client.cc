@@ -51,13 +51,16 @@ class Client : public DcmSCU
 		return EC_Normal;
 	}
 
-	// N-CREATE or N-SET, which DcmSCU has not. *ret_error: Error ID (0000,0903), 0: none.
-	OFCondition request(T_ASC_PresentationContextID presentation, T_DIMSE_Message *message, DcmDataset *dataset,
-			    Uint16 *ret_status, Uint16 *ret_error)
+	// N-CREATE or N-SET, which DcmSCU has not. *ret_error: Error ID (0000,0903), 0: none. An answer to another message
+	// than this one, or about another step than UID, is a bad one.
+	OFCondition request(T_ASC_PresentationContextID presentation, T_DIMSE_Message *message, const char *uid,
+			    DcmDataset *dataset, Uint16 *ret_status, Uint16 *ret_error)
 	{
 		const bool creates = message->CommandField == DIMSE_N_CREATE_RQ;
 		DcmDataset *detail = nullptr, *attributes = nullptr;
 		T_DIMSE_Message reply = {};
+		const T_DIMSE_N_CreateRSP &created = reply.msg.NCreateRSP;
+		const T_DIMSE_N_SetRSP &changed = reply.msg.NSetRSP;
 		OFCondition condition = sendDIMSEMessage(presentation, message, dataset);
 
 		if (condition.good())
@@ -72,10 +75,17 @@ class Client : public DcmSCU
 		if (detail != nullptr)
 			detail->findAndGetUint16(DCM_ErrorID, *ret_error);
 		delete detail;
-		*ret_status = creates ? reply.msg.NCreateRSP.DimseStatus : reply.msg.NSetRSP.DimseStatus;
-		if ((creates ? reply.msg.NCreateRSP.DataSetType : reply.msg.NSetRSP.DataSetType) != DIMSE_DATASET_NULL)
+		*ret_status = creates ? created.DimseStatus : changed.DimseStatus;
+		if ((creates ? created.DataSetType : changed.DataSetType) != DIMSE_DATASET_NULL)
 			condition = receiveDIMSEDataset(&presentation, &attributes);
 		delete attributes;
+		const int answered = creates ? created.MessageIDBeingRespondedTo : changed.MessageIDBeingRespondedTo;
+		const bool named = creates ? created.opts & O_NCREATE_AFFECTEDSOPINSTANCEUID
+					   : changed.opts & O_NSET_AFFECTEDSOPINSTANCEUID;
+		const char *about = creates ? created.AffectedSOPInstanceUID : changed.AffectedSOPInstanceUID;
+
+		if (condition.good() && (answered != requests || (named && strcmp(about, uid) != 0)))
+			return DIMSE_BADMESSAGE;
 		return condition;
 	}
 
@@ -438,7 +448,7 @@ int dimse_step_create(struct dimse *dimse, const char *uid, const cJSON *attribu
 	OFStandard::strlcpy(request.AffectedSOPClassUID, UID_ModalityPerformedProcedureStepSOPClass,
 			    sizeof(request.AffectedSOPClassUID));
 	OFStandard::strlcpy(request.AffectedSOPInstanceUID, uid, sizeof(request.AffectedSOPInstanceUID));
-	OFCondition condition = dimse->client.request(dimse->presentation, &message, &dataset, &status, &error);
+	OFCondition condition = dimse->client.request(dimse->presentation, &message, uid, &dataset, &status, &error);
 	if (condition.bad())
 		return broken("N-CREATE", condition, err);
 	if (status == STATUS_N_DuplicateSOPInstance)
@@ -462,7 +472,7 @@ int dimse_step_set(struct dimse *dimse, const char *uid, const cJSON *attributes
 	OFStandard::strlcpy(request.RequestedSOPClassUID, UID_ModalityPerformedProcedureStepSOPClass,
 			    sizeof(request.RequestedSOPClassUID));
 	OFStandard::strlcpy(request.RequestedSOPInstanceUID, uid, sizeof(request.RequestedSOPInstanceUID));
-	OFCondition condition = dimse->client.request(dimse->presentation, &message, &dataset, &status, &error);
+	OFCondition condition = dimse->client.request(dimse->presentation, &message, uid, &dataset, &status, &error);
 	if (condition.bad())
 		return broken("N-SET", condition, err);
 	if (status == STATUS_N_NoSuchSOPInstance)

@@ -13,6 +13,7 @@ Usage: peer.py idle PORT ADDRESS COUNT    COUNT connections from ADDRESS that sa
     unasked   takes objects, and knows neither C-FIND nor storage commitment
     silent    never answers C-STORE
     drips     answers C-FIND a byte every 0.2 s
+    mixes-up  answers what is told of a performed step first as another message, then about another step, then rightly
     hangs-up  breaks the connection at every 20th object
     hangs     accepts associations, and answers nothing on them
 """
@@ -155,6 +156,14 @@ class Association:
         self.message(context, {0x0002: COMMIT, 0x0100: 0x0100, 0x0110: 1, 0x1000: fields[0x1001], 0x1002: 2 if refuses else 1},
                      element(8, 0x1195, transaction) + element(8, 0x1198 if refuses else 0x1199, listed, b"SQ"))
 
+    def step(self, context, fields):
+        with LOCK:
+            COUNT["asked"] += 1
+            asked = COUNT["asked"] if self.mode == "mixes-up" else 3
+        named = fields.get(0x1000) or fields[0x1001]
+        self.message(context, {0x0002: fields.get(0x0002) or fields[0x0003], 0x0100: 0x8000 | fields[0x0100], 0x0900: 0,
+                               0x0120: fields[0x0110] + (7 if asked == 1 else 0), 0x1000: "1.2.3" if asked == 2 else named})
+
     def serve(self):
         parts = {1: b"", 0: b""}
         fields = None
@@ -188,6 +197,8 @@ class Association:
                     self.find(context, fields)
                 elif fields[0x0100] == 0x130:
                     self.commit(context, fields, dataset)
+                elif fields[0x0100] in (0x140, 0x120):
+                    self.step(context, fields)
                 elif fields[0x0100] == 0x30:
                     self.message(context, {0x0002: fields[0x0002], 0x0100: 0x8030, 0x0120: fields[0x0110], 0x0900: 0})
 

@@ -283,6 +283,19 @@ test_performed_steps_are_told() {
 	expect_status 204
 	! grep -E 'Müller|Jane' "$work/cbctd.err" || fail "no patient in the log"
 }
+
+# An answer that is none of ours counts for nothing: it is told again.
+test_an_answer_about_another_step_is_none() {
+	need_dcmtk
+	start_peer mixes-up dimse
+	jq -n '{destinations: [{name: "ris", kind: "mpps", host: "127.0.0.1", port: '"$peer_port"', title: "PEER", timeout_s: 5}]}' >"$work/destinations.json"
+	start_daemon --destinations "$work/destinations.json" --send-pause 0.2
+	jq '.study = {uid: "1.2.3.11", step_id: "S1", procedure_id: "RPS1"} | .patient = {position: "HFS"}' "$work/scan/scan.json" >"$work/stepped.json"
+	post_scan_of "$work/stepped.json"
+	post_job "{\"scan\": \"SCAN\", $recipe, \"send\": []}"
+	step_becomes '.state == "waiting" and .attempts == 3'
+	[ "$(grep -c ^0140 "$work/peer.log")" = 3 ] || fail "it is told until it is answered, got $(cat "$work/peer.log")"
+}
 post_scan_of() {
 	scan=$(curl -sSf "$url/v1/scans" -H 'Content-Type: application/json' -d @"$1" | jq -r .id)
 }
