@@ -82,5 +82,5 @@ export function warningList(warnings) {
 		[...warnings].sort((a, b) => severities.indexOf(a.severity) - severities.indexOf(b.severity)).map(
 			({ code, severity, summary, detail }) => h('li', { class: severity },
 				h('strong', {}, t(severity)), ` ${t(summary)} `,
-				h('details', {}, h('summary', {}, code.replaceAll(/[_-]/g, ' ')), detail))))
+				h('details', {}, h('summary', {}, t('Figures')), detail, ' ', h('code', {}, code)))))
 }

@@ -65,6 +65,7 @@ export const strings = {
 	'Failed today': 'Heute fehlgeschlagen',
 	'Fan angle': 'Fächerwinkel',
 	'Field of view': 'Messfeld',
+	'Figures': 'Zahlen',
 	'Format': 'Format',
 	'Full': 'Alles',
 	'Full screen': 'Vollbild',
