@@ -380,7 +380,7 @@ $(BUILD)/cbct-worker-faulty: $(call objects,daemon/worker.c) $(library) $(cuda_o
 
 ifdef cuda_objects
 check-gpu: ## the CUDA backend against the CPU's, and through the daemon; skipped aloud without a GPU
-	@$(MAKE) --no-print-directory -j$$(nproc) all $(BUILD)/gpu_check $(BUILD)/cbct-worker-faulty $(BUILD)/cbct-worker-held
+	@$(MAKE) --no-print-directory -j$$(nproc) all $(BUILD)/gpu_check $(BUILD)/gpu_cards $(BUILD)/cbct-worker-faulty $(BUILD)/cbct-worker-held
 	@$(BUILD)/gpu_check
 	@BUILD=$(BUILD) tests/gpu/end_to_end.sh
 	@BUILD=$(BUILD) tests/gpu/sanitize.sh

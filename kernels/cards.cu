@@ -3,24 +3,28 @@
  * the bus, each on its own stream, in the order that work was asked for; and the parts of a SART iteration between two
  * exchanges.
  */
+#include <atomic>
+
 #include "kernels/internal.cuh"
 
 static const int THREADS = 256;
 
 /* ---- from card to card ---- */
 
+/* Access stays once it is there, and asking for it again is an error: a process remembers what it has. */
 static bool reach(const struct device *device, const struct device *other)
 {
+	static std::atomic<bool> reached[GPUS_MOST][GPUS_MOST];
+	std::atomic<bool> *there = &reached[device->index][other->index];
 	int can = 0;
 
+	if (*there)
+		return true;
 	if (cudaDeviceCanAccessPeer(&can, device->index, other->index) != cudaSuccess || !can)
 		return false;
-	cudaError_t status = cudaDeviceEnablePeerAccess(other->index, 0);
-	if (status == cudaErrorPeerAccessAlreadyEnabled) {
-		cudaGetLastError();
-		return true;
-	}
-	return status == cudaSuccess;
+	const cudaError_t status = cudaDeviceEnablePeerAccess(other->index, 0);
+	*there = status == cudaSuccess || status == cudaErrorPeerAccessAlreadyEnabled;
+	return *there;
 }
 
 bool cuda_connect(struct device *const devices[], int count)

@@ -1694,7 +1694,7 @@ static void check_limit(void)
 static void check_briefly(struct device *devices[2])
 {
 	static const char *const names[] = {"cube", "by view", "cut off", "flat", "one voxel", "one pixel", "thin"};
-	static const enum bend bends[] = {BEND_NONE, BEND_TILTED, BEND_STEEP};
+	static const enum bend bends[] = {BEND_NONE, BEND_TILTED, BEND_STEEP, BEND_TURNED};
 
 	for (size_t i = 0; i < sizeof(kinds) / sizeof(kinds[0]); i++)
 		for (size_t n = 0; n < sizeof(names) / sizeof(names[0]); n++)
@@ -1702,7 +1702,8 @@ static void check_briefly(struct device *devices[2])
 				struct scene_options options = kinds[i].options;
 				struct scene scene;
 
-				if (strcmp(kinds[i].name, names[n]) != 0)
+				/* What a detector turned a little has of its own, the first scene has. */
+				if (strcmp(kinds[i].name, names[n]) != 0 || (bends[b] == BEND_TURNED && n > 0))
 					continue;
 				options.bend = bends[b];
 				for (int k = 0; k < 3; k++)

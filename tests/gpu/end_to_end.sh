@@ -127,18 +127,17 @@ if [ -x "$BUILD/cbct-worker-faulty" ]; then
 	stop
 fi
 
-# What arrives while the arm turns, in any order, what phantoms become, and jobs on two cards: the daemon's own tests.
-suites="arriving phantom"
-if [ "$(nvidia-smi -L | wc -l)" -gt 1 ]; then
-	suites+=" devices"
-else
-	echo "SKIPPED: jobs on two devices need two"
-fi
+# What arrives while the arm turns, in any order, and what phantoms become: the daemon's own tests.
 if command -v curl >/dev/null && command -v jq >/dev/null; then
-	# shellcheck disable=SC2086
-	check "the daemon's tests of $suites" env BACKEND=cuda BUILD="$BUILD" tests/run.sh $suites
+	check "the daemon's tests of arriving and phantom" env BACKEND=cuda BUILD="$BUILD" tests/run.sh arriving phantom
 else
-	echo "SKIPPED: the daemon's tests of $suites need curl and jq"
+	echo "SKIPPED: the daemon's tests of arriving and phantom need curl and jq"
+fi
+# The daemon's own tests of jobs on several devices pretend that there are cards; these are real ones.
+if [ "$(nvidia-smi -L | wc -l)" -gt 1 ] && command -v python3 >/dev/null; then
+	check "jobs on several cards" python3 tests/gpu/several_cards.py "$BUILD" "$work/several"
+else
+	echo "SKIPPED: jobs on several cards need two of them, and python3"
 fi
 
 echo "$failures failures"
