@@ -86,12 +86,12 @@ export class ReferencePage {
 		}
 		const all = schema.allOf ?? schema.oneOf ?? schema.anyOf
 		if (all)
-			return h('span', {}, all.flatMap((part, i) => [i > 0 ? schema.allOf ? ' + ' : t(' or ') : '', this.#schema(part)]), inline(usual(schema)))
+			return h('span', {}, all.flatMap((part, i) => [i > 0 ? schema.allOf ? ' + ' : t(' or ') : '', this.#schema(part)]), ' ', inline(usual(schema)))
 		if (schema.properties)
 			return h('dl', {}, Object.entries(schema.properties).map(([name, part]) => h('div', {}, h('dt', {}, h('code', {}, name), schema.required?.includes(name) ? ' *' : ''), h('dd', {}, this.#schema(part), ' ', inline(part.description ?? '')))))
 		if (schema.type === 'array')
 			return h('span', {}, t('list of '), this.#schema(schema.items))
-		return h('span', {}, [schema.type ?? []].flat().join(t(' or ')), inline(limits(schema) + usual(schema)))
+		return h('span', {}, inline([[schema.type ?? []].flat().join(t(' or ')), limits(schema), usual(schema)].filter(Boolean).join(' ')))
 	}
 
 	#open(name) {
@@ -118,5 +118,5 @@ export class ReferencePage {
 
 const coded = value => `\`${value}\``
 const limits = ({ const: only, enum: values, minimum, maximum, pattern }) => [only !== undefined && coded(only), values && values.map(coded).join(', '),
-	minimum !== undefined && `≥ ${minimum}`, maximum !== undefined && `≤ ${maximum}`, pattern && coded(pattern)].filter(Boolean).map((text, i) => i === 0 ? ` ${text}` : text).join(', ')
-const usual = schema => schema.default === undefined ? '' : ` (${coded(JSON.stringify(schema.default))})`
+	minimum !== undefined && `≥ ${minimum}`, maximum !== undefined && `≤ ${maximum}`, pattern && coded(pattern)].filter(Boolean).join(', ')
+const usual = schema => schema.default === undefined ? '' : `(${coded(JSON.stringify(schema.default))})`
