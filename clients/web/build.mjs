@@ -33,11 +33,12 @@ const common = {
 }
 const outputOf = (result, source) => basename(Object.entries(result.metafile.outputs).find(([, output]) => output.entryPoint === source)[0])
 
-const worker = await build({ ...common, entryPoints: ['src/decode.js'], format: 'iife' })
+const workers = await build({ ...common, entryPoints: ['src/decode.js', 'src/probe.js'], format: 'iife' })
 const page = await build({
 	...common, entryPoints: ['src/main.js', 'src/style.css'], format: 'esm', splitting: true,
 	define: {
-		DECODE_WORKER: JSON.stringify(`/assets/${outputOf(worker, 'src/decode.js')}`),
+		DECODE_WORKER: JSON.stringify(`/assets/${outputOf(workers, 'src/decode.js')}`),
+		PROBE_WORKER: JSON.stringify(`/assets/${outputOf(workers, 'src/probe.js')}`),
 		LANGUAGES: JSON.stringify(readdirSync(join(here, 'src/lang')).map(file => basename(file, '.js')).sort()),
 	},
 })
@@ -70,7 +71,7 @@ function licenceOf(directory) {
 	return `${name} ${version}: ${license}\n\n${texts.join('\n\n')}\n`
 }
 
-const licences = `What the page of cbctd is made from, beside its own sources.\n\n${packagesIn(worker, page).map(licenceOf).join(`\n${'-'.repeat(78)}\n\n`)}`
+const licences = `What the page of cbctd is made from, beside its own sources.\n\n${packagesIn(workers, page).map(licenceOf).join(`\n${'-'.repeat(78)}\n\n`)}`
 
 /* ---- the files that esbuild does not write ---- */
 

@@ -88,7 +88,9 @@ export const complaints = []
 const common = ['--disable-gpu-compositing', '--no-sandbox', '--disable-quic', '--no-first-run', '--disable-background-networking', '--disable-component-update', '--disable-sync']
 /* WebGL 2 without a graphics card. */
 export const software = ['--use-angle=swiftshader', '--enable-unsafe-swiftshader']
-export const withoutGraphics = ['--disable-3d-apis']
+export const withoutGraphics = ['--disable-software-rasterizer']
+/* A page has no WebGL, though a worker of its has. */
+export const forbidden = ['--disable-3d-apis']
 
 export function launch(graphics) {
 	return chromium.launch({ executablePath, headless: true, args: [...common, ...graphics] })

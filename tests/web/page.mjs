@@ -2,7 +2,7 @@
 import { readFileSync } from 'node:fs'
 import { createRequire } from 'node:module'
 import {
-	origin, api, post, ended, picture, grayOf, shrink, mirrored, flipped, transposed, correlation, launch, software, withoutGraphics, open,
+	origin, api, post, ended, picture, grayOf, shrink, mirrored, flipped, transposed, correlation, launch, software, withoutGraphics, forbidden, open,
 	realComplaints, shoot, until, expect, test, runTests,
 } from './lib.mjs'
 
@@ -222,23 +222,31 @@ test('planes are the daemon\'s slices, pixel by pixel', async () => {
 	await page.context().close()
 })
 
-/* Software that says it were a card, as which WebGL 2 is then used. */
+/* The worker that is asked says it were a card, as which WebGL 2 is then used. */
 async function pretendCard(page) {
-	await page.addInitScript(() => {
-		const { getParameter } = WebGL2RenderingContext.prototype, unmaskedRenderer = 0x9246
-		WebGL2RenderingContext.prototype.getParameter = function (name) {
-			return name === unmaskedRenderer ? 'a graphics card' : getParameter.call(this, name)
-		}
-	})
+	await page.route('**/assets/probe-*.js', route => route.fulfill({ contentType: 'text/javascript', body: 'postMessage({ software: false })' }))
 	await page.reload()
+}
+
+/* Counts the contexts of WebGL that the page asks for itself, which may hold it up until a driver has started. */
+const countContexts = () => {
+	const { getContext } = HTMLCanvasElement.prototype
+	window.contexts = 0
+	HTMLCanvasElement.prototype.getContext = function (kind, ...options) {
+		window.contexts += kind.includes('webgl') ? 1 : 0
+		return getContext.call(this, kind, ...options)
+	}
 }
 
 for (const graphics of ['software', 'a graphics card']) {
 	test(`the rendering by ${graphics} shows the patient from the front, the left to the right`, async () => {
-		const page = await openFinished()
-		if (graphics !== 'software')
-			await pretendCard(page)
+		const page = await open(browser, '/')
+		await page.addInitScript(countContexts)
+		await (graphics === 'software' ? page.reload() : pretendCard(page))
+		await page.click(`.jobs a[href="#/jobs/${finished}"]`)
 		await page.waitForSelector(`${tile('3d')}[data-shown=final]`)
+		await planePixels(page, 'z')
+		expect(await page.evaluate(() => window.contexts > 0) === (graphics !== 'software'), 'WebGL in the page where a card draws, and only there')
 		expect(page.requests.some(url => url.includes('/render-')) === (graphics !== 'software'), 'NiiVue where a card draws, and only there')
 		await page.focus(tile('3d'))
 		for (let i = 0; i < 4; i++)
@@ -1017,8 +1025,8 @@ test('the interface is a page to read, and has every operation of the schema', a
 	await until('an example', () => page.textContent('.entry:not([hidden])'), text => text.includes('"preset": "fast"'))
 	await page.click('.entry:not([hidden]) a:has-text("JobRequest")')
 	await page.waitForSelector('#schema-JobRequest[open] dt:has-text("sart")')
-	const member = name => page.$eval(`#schema-JobRequest dt:text-is("${name}") + dd`, element => element.textContent)
-	for (const [name, text] of [['binning', 'integer ≥ 1, ≤ 8 or auto or null (1) '], ['devices', 'integer ≥ 1, ≤ 16 or all or null '], ['priority', ' routine, urgent, stat, null ("routine") ']])
+	const member = name => page.$eval(`#schema-JobRequest dt:has(code:text-is("${name}")) + dd`, element => element.textContent)
+	for (const [name, text] of [['binning', 'integer ≥ 1, ≤ 8 or auto or null (1) '], ['devices', 'integer ≥ 1, ≤ 16 or all or null '], ['priority', 'routine, urgent, stat, null ("routine") ']])
 		expect((await member(name)).startsWith(text), `${name} is ${text}, got ${await member(name)}`)
 	await accessible(page, 'the interface')
 	await fits(page, 'the interface')
@@ -1262,6 +1270,16 @@ test('without WebGL 2 the daemon draws: slices and a contact sheet as PNG', asyn
 	await until('another volume', () => source('z'), src => src.includes('/volumes/fdk/'))
 	expect(!page.requests.some(url => url.includes('format=shuffled')), 'no volume fetched')
 	await shoot(page, 'without-webgl')
+	await plain.close()
+})
+
+test('where WebGL is forbidden the page draws by itself, or the daemon where a card was promised', async () => {
+	const plain = await launch(forbidden)
+	const page = await open(plain, finishedPath)
+	await page.waitForSelector(`${tile('3d')}[data-shown=final] canvas.flat:not([hidden])`)
+	await pretendCard(page)
+	await page.waitForSelector(`${tile('3d')} img.sheet:not([hidden])`)
+	await planePixels(page, 'z')
 	await plain.close()
 })
 

@@ -5,6 +5,7 @@
 import { h, write, inFrame, throttle } from './dom.js'
 import { tellRoom } from './plane.js'
 import { Rays } from './rays.js'
+import { graphicsOf } from './graphics.js'
 import { limitsOf, metalLeast } from './surface.js'
 import { volumePath } from './api.js'
 import { fetchUntil, scaleFor, thinned } from './voxels.js'
@@ -15,30 +16,26 @@ const scaleMost = 8
 const metalVoxels = 20 /* that are metal before there is any */
 const settleTime = 150 /* ms: the rendering follows the window once the hand rests; each change costs a whole volume */
 
-let graphics
+let graphics, probing = null /* { software } or null, once it is known; a promise of the same */
 
-/*
- * { software } or null: asked of a canvas of its own, which is given back at
- * once; only when the first planes are there, since a driver may take long to start.
- */
-export function probeGraphics() {
-	if (graphics === undefined)
-		graphics = probe()
-	return graphics
-}
+/* Asked of a worker: a driver, or software in a browser that composes by it as well, may take half a second to start, and the page goes on. */
+export const probeGraphics = () => probing ??= probe().then(found => graphics = found)
 
 function probe() {
-	const gl = document.createElement('canvas').getContext('webgl2', { failIfMajorPerformanceCaveat: false })
-	if (!gl)
-		return null
-	const info = gl.getExtension('WEBGL_debug_renderer_info')
-	const name = info ? String(gl.getParameter(info.UNMASKED_RENDERER_WEBGL)) : ''
-	gl.getExtension('WEBGL_lose_context')?.loseContext()
-	return { software: /swiftshader|llvmpipe|software|basic render/i.test(name) }
+	return new Promise(resolve => {
+		const worker = new Worker(PROBE_WORKER)
+		/* A worker may have no WebGL where the page does (Safari 16, Firefox before 105). */
+		const end = found => {
+			worker.terminate()
+			resolve(found ?? graphicsOf(document.createElement('canvas')))
+		}
+		worker.onmessage = ({ data }) => end(data)
+		worker.onerror = () => end(null)
+	})
 }
 
 const touch = matchMedia('(pointer: coarse)').matches
-const voxelsMost = () => probeGraphics()?.software ? 96 ** 3 : touch ? 192 ** 3 : 256 ** 3
+const voxelsMost = () => graphics?.software ? 96 ** 3 : touch ? 192 ** 3 : 256 ** 3
 
 export class Spatial {
 	#view
@@ -96,8 +93,10 @@ export class Spatial {
 	show(source) {
 		this.#source = source
 		this.#grid = null
-		this.#failed ||= probeGraphics() === null
-		this.settle()
+		probeGraphics().then(found => {
+			this.#failed ||= found === null
+			this.settle()
+		})
 	}
 
 	update(changed) {
@@ -116,7 +115,7 @@ export class Spatial {
 	/* Whether the page traces the rays itself. */
 	#isTraced() {
 		const { mode } = this.#view.solid
-		return mode === 'mip' || mode === 'surface' && !this.#failed && probeGraphics().software
+		return mode === 'mip' || mode === 'surface' && !this.#failed && graphics.software
 	}
 
 	#turned() {
@@ -146,7 +145,7 @@ export class Spatial {
 	/* Brings the rendering to the newest volume and window, one step at a time. */
 	async #settle() {
 		const source = this.#source
-		if (source === null || !this.element.isConnected)
+		if (source === null || graphics === undefined || !this.element.isConnected)
 			return
 		const { mode } = this.#view.solid
 		this.#reveal()

@@ -82,12 +82,14 @@ export class Viewer {
 			if (source !== this.#source)
 				return
 			this.spatial.show(source)
-			if (source.job !== null && probeGraphics() !== null && countOf(source.volume.size) <= wholeMost)
+			if (source.job !== null && countOf(source.volume.size) <= wholeMost)
 				this.#fetch(source)
 		})
 	}
 
 	async #fetch(source) {
+		if (await probeGraphics() === null)
+			return
 		/* Meanwhile the daemon goes on drawing the planes. */
 		const grid = await fetchUntil(source.job, source.volume, 1, { wanted: () => source === this.#source, told: this.troubled })
 		if (grid !== null && source === this.#source)
