@@ -51,6 +51,7 @@ struct run {
 	const char *directory;
 	const struct recipe *recipe;
 	struct recon *recon;               /* NULL before it is opened */
+	double told, before;               /* the fraction that was told last, and that when it was opened last */
 	struct checkpointer *checkpointer; /* NULL where nobody asks for checkpoints */
 	struct history history;            /* of the iterations so far */
 	struct provenance provenance;
@@ -136,12 +137,14 @@ static void prepare(struct run *run, enum stage stage, int iteration);
 
 static void run_progress(void *context, enum stage stage, int iteration, double fraction)
 {
-	const struct reconstruction_hooks *hooks = ((struct run *)context)->hooks;
+	struct run *run = context;
+	const struct reconstruction_hooks *hooks = run->hooks;
 
+	run->told = run->before + (1 - run->before) * fraction;
 	if (stage != STAGE_FDK) /* FDK's progress is reported with every projection: push_some */
-		prepare(context, stage, iteration);
+		prepare(run, stage, iteration);
 	if (hooks->recon.progress != NULL)
-		hooks->recon.progress(hooks->recon.context, stage, iteration, fraction);
+		hooks->recon.progress(hooks->recon.context, stage, iteration, run->told);
 }
 
 static void run_row(void *context, const struct history_row *row)
@@ -552,6 +555,7 @@ static int open_again(struct reconstruction *reconstruction, struct error *err)
 	recon_free(reconstruction->recon);
 	reconstruction->recon = NULL;
 	reconstruction->run.recon = NULL;
+	reconstruction->run.before = reconstruction->run.told;
 	reconstruction->pushed = 0;
 	return open_recon(reconstruction, err);
 }

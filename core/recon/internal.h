@@ -67,6 +67,8 @@ struct recon {
 	struct volume_norms norms;
 	struct stopping stopping;     /* of automatic iterations */
 	double work_done, work_total; /* in FDKs of the whole scan */
+	double refine_work;           /* of that, what finding the views' poses takes, */
+	double refine_from;           /* and what was done before it */
 	double fraction;              /* of the work, as it was told last: it does not fall */
 };
 
@@ -75,6 +77,8 @@ struct recon {
  * progress bar only.
  */
 static const double WORK_LOAD = 0.2, WORK_FDK = 1, WORK_TV = 0.2;
+/* How much faster a device is than the processor, which refines. */
+static const double WORK_DEVICE = 30;
 
 static inline double iteration_work(const struct recipe *recipe)
 {

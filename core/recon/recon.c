@@ -168,6 +168,20 @@ static int open_rim(struct recon *recon, struct error *err)
 	return rim_new(&recipe->grid, &recon->orbit, recipe->iterate.nonnegative, &recon->rim, err);
 }
 
+/* The views of a recipe that refines the geometry, and the time that it takes. */
+static int open_refining(struct recon *recon, struct error *err)
+{
+	int code = refining_new(&recon->recipe, recon->geometry, &recon->orbit, &recon->refining, err);
+
+	if (code == 0)
+		code = refining_work(recon->refining, &recon->recipe.grid, recon->geometry->count, &recon->refine_work,
+				     err);
+	if (recon->backend != &backend_cpu)
+		recon->refine_work *= WORK_DEVICE;
+	recon->work_total += recon->refine_work;
+	return code;
+}
+
 int recon_open(const struct backend *backend, struct device *device, const struct geometry *geometry,
 	       const struct linearise *linearise, const struct recipe *recipe, const struct recon_hooks *hooks,
 	       struct recon **ret_recon, struct error *err)
@@ -195,7 +209,7 @@ int recon_open(const struct backend *backend, struct device *device, const struc
 	if (code == 0 && recon->recipe.hold_out)
 		code = held_out_new(&recon->orbit, recon->geometry, &recon->held_out, err);
 	if (code == 0)
-		code = refining_new(&recon->recipe, recon->geometry, &recon->orbit, &recon->refining, err);
+		code = open_refining(recon, err);
 	if (code == 0)
 		code = open_corrections(recon, err);
 	if (code == 0)
@@ -324,9 +338,18 @@ static int move_views(const struct recon *recon, const struct path *path, struct
 	return code;
 }
 
+static void tell_refining(void *context, double share)
+{
+	struct recon *recon = context;
+
+	recon->work_done = recon->refine_from + share * recon->refine_work;
+	recon_tell_progress(recon, recon_runs_fdk(recon) ? STAGE_FDK : STAGE_LOAD, recon->iteration);
+}
+
 int recon_refine(struct recon *recon, struct refinement *ret_refinement, struct geometry *ret_geometry,
 		 struct error *err)
 {
+	const struct refine_watch watch = {&recon->cancel, tell_refining, recon};
 	const struct input *input = &recon->input;
 	struct refinement refinement = {.held_out = 0};
 	int code = 0;
@@ -334,9 +357,11 @@ int recon_refine(struct recon *recon, struct refinement *ret_refinement, struct 
 	if (recon->pushed_count < recon->geometry->count)
 		return error_set(err, ERR_CONFLICT, "%d of %d views have come", recon->pushed_count,
 				 recon->geometry->count);
+	recon->refine_from = recon->work_done;
 	if (recon->refining != NULL)
 		code = refining_find(recon->refining, &recon->recipe, &recon->orbit, input->blank, input->counts.blank,
-				     &recon->cancel, &refinement, err);
+				     &watch, &refinement, err);
+	recon->work_done = recon->refine_from + recon->refine_work;
 	if (code == 0 && refinement.accepted)
 		code = move_views(recon, &refinement.path, ret_geometry, err);
 	if (code == 0)

@@ -77,10 +77,21 @@ int refining_take(struct refining *refining, const struct backend *backend, stru
 }
 
 int refining_find(struct refining *refining, const struct recipe *recipe, const struct orbit *orbit, const int *blank,
-		  int blanks, const struct cancel *cancel, struct refinement *ret_refinement, struct error *err)
+		  int blanks, const struct refine_watch *watch, struct refinement *ret_refinement, struct error *err)
 {
 	for (int i = 0; i < blanks; i++)
 		reduced_leave_out(&refining->reduced, blank[i]);
 	return refine_find(&refining->reduced, orbit, recipe->refine.motion ? REFINE_MOTION : REFINE_GEOMETRY,
-			   recipe->mu_water, cancel, ret_refinement, err);
+			   recipe->mu_water, watch, ret_refinement, err);
+}
+
+int refining_work(const struct refining *refining, const struct grid *grid, int views, double *ret_work,
+		  struct error *err)
+{
+	double fdks = 0, updates = 0;
+	int code = refining == NULL ? 0 : refine_work(&refining->reduced, &fdks, &updates, err);
+
+	if (code == 0)
+		*ret_work = fdks * updates / ((double)grid_voxels(grid) * views);
+	return code;
 }

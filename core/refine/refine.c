@@ -15,6 +15,10 @@
 enum { VIEWS_LEAST = 48, BINS_LEAST = 24, HELD_OUT = 8, SUBSETS = 10, EDGE = 4, IMAGES = 1 + PATH_NUMBERS };
 /* Iterations before the first step; steps with the same knots; how often these are doubled. */
 enum { WARM = 4, STEPS = 5, DOUBLINGS = 2, TV_STEPS = 30 };
+/* What an iteration with TV, and a step of the path, take, in FDKs of the bins: for the progress bar. */
+enum { ITERATION_WORK = 5, STEP_WORK = 10 };
+enum { ALL_STEPS = STEPS * (DOUBLINGS + 1) }; /* and as many iterations behind the first, still and moved */
+enum { ALL_WORK = 2 * (WARM + ALL_STEPS) * ITERATION_WORK + ALL_STEPS * STEP_WORK };
 static const double PI = 3.14159265358979323846;
 static const double ARC_LEAST = 2.8;                        /* radians */
 static const double KNOTS_APART = 0.7;                      /* radians, at first */
@@ -35,7 +39,8 @@ static const double EXPECTED[REFINE_KINDS][PATH_NUMBERS] = {
 
 struct fit {
 	const struct reduced *reduced;
-	const struct cancel *cancel;
+	const struct refine_watch *watch;
+	int work_done; /* of ALL_WORK */
 	enum refine_kind kind;
 	struct geometry geometry; /* of the bins, as the path moves it */
 	struct grid grid;
@@ -204,6 +209,19 @@ int refine_bytes(const struct reduced *reduced, size_t *ret_bytes, struct error 
 	return code;
 }
 
+int refine_work(const struct reduced *reduced, double *ret_fdks, double *ret_updates, struct error *err)
+{
+	struct fit fit;
+	int code = describe(&fit, reduced, err);
+
+	if (code == 0) {
+		*ret_fdks = ALL_WORK;
+		*ret_updates = (double)grid_voxels(&fit.grid) * fit.geometry.count;
+	}
+	fit_clear(&fit);
+	return code;
+}
+
 static int allocate(struct fit *fit, struct error *err)
 {
 	const struct geometry *geometry = &fit->geometry;
@@ -281,12 +299,23 @@ static int place_views(struct fit *fit, const struct path *path, struct error *e
 	return backend_cpu.plan_new(fit->device, &options, &fit->plan, err);
 }
 
+static void tell_work(struct fit *fit, int work)
+{
+	fit->work_done += work;
+	if (fit->watch->progress != NULL)
+		fit->watch->progress(fit->watch->context, (double)fit->work_done / ALL_WORK);
+}
+
 static int iterate(struct fit *fit, struct error *err)
 {
+	const struct cancel *cancel = fit->watch->cancel;
 	struct iteration_sums sums;
-	int code = backend_cpu.sart_iterate(fit->plan, fit->measured, fit->volume, fit->cancel, &sums, err);
+	int code = backend_cpu.sart_iterate(fit->plan, fit->measured, fit->volume, cancel, &sums, err);
 
-	return code == 0 ? backend_cpu.tv(fit->plan, fit->volume, &fit->tv, fit->cancel, err) : code;
+	if (code == 0)
+		code = backend_cpu.tv(fit->plan, fit->volume, &fit->tv, cancel, err);
+	tell_work(fit, ITERATION_WORK);
+	return code;
 }
 
 /* ---- views beside the volume's projections ---- */
@@ -423,7 +452,7 @@ static int step(struct fit *fit, struct path *path, struct error *err)
 		if (code == 0)
 			code = project(fit, fit->work, fit->used, fit->used_count, i + 1, err);
 		if (code == 0)
-			code = cancel_check(fit->cancel, err);
+			code = cancel_check(fit->watch->cancel, err);
 	}
 	if (code < 0)
 		return code;
@@ -432,6 +461,7 @@ static int step(struct fit *fit, struct path *path, struct error *err)
 		add_up_view(fit, fit->used[i]);
 		pulse_beat();
 	}
+	tell_work(fit, STEP_WORK);
 	return path_step(path, fit->views, fit->geometry.count, EXPECTED[fit->kind], FACTOR, err);
 }
 
@@ -532,14 +562,14 @@ static int run(struct fit *fit, double length, struct refinement *refinement, st
 }
 
 int refine_find(const struct reduced *reduced, const struct orbit *orbit, enum refine_kind kind, double mu_water,
-		const struct cancel *cancel, struct refinement *ret_refinement, struct error *err)
+		const struct refine_watch *watch, struct refinement *ret_refinement, struct error *err)
 {
 	struct refinement refinement = {.held_out = 0};
 	struct fit fit;
 	double length = 0;
 	int code = describe(&fit, reduced, err);
 
-	fit.cancel = cancel;
+	fit.watch = watch;
 	fit.kind = kind;
 	fit.tv.unit = mu_water / 1000;
 	if (code == 0)

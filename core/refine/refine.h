@@ -47,8 +47,17 @@ bool refine_is_possible(const struct geometry *geometry, const struct orbit *orb
 double refine_place(const struct orbit *orbit, int view);
 /* Bytes of the host's memory that refine_find takes: it works on the CPU's backend. */
 int refine_bytes(const struct reduced *reduced, size_t *ret_bytes, struct error *err);
-/* orbit: of the scan. mu_water in 1/mm. The same bits for any number of threads. cancel may be NULL. */
+/* What it takes, in FDKs of the bins and their grid, and how many updates of a voxel by a view one of these is. */
+int refine_work(const struct reduced *reduced, double *ret_fdks, double *ret_updates, struct error *err);
+
+/* Who watches it. */
+struct refine_watch {
+	const struct cancel *cancel;                   /* NULL: nobody can cancel it */
+	void (*progress)(void *context, double share); /* behind each step: the share of all of them that is done */
+	void *context;
+};
+/* orbit: of the scan. mu_water in 1/mm. The same bits for any number of threads. */
 int refine_find(const struct reduced *reduced, const struct orbit *orbit, enum refine_kind kind, double mu_water,
-		const struct cancel *cancel, struct refinement *ret_refinement, struct error *err);
+		const struct refine_watch *watch, struct refinement *ret_refinement, struct error *err);
 
 #endif

@@ -213,6 +213,20 @@ static int make_digest(struct digester *digester, struct job *job, const struct 
 
 /* ---- the threads ---- */
 
+/* The job began anew meanwhile, so that the volume is gone: rows go before their files. */
+static bool is_void(struct store *store, const char *job, const struct volume_record *volume)
+{
+	struct volume_record *volumes = NULL;
+	struct error ignored;
+	int count = 0;
+	bool there = store_job_volumes(store, job, &volumes, &count, &ignored) != 0;
+
+	for (int i = 0; i < count && !there; i++)
+		there = strcmp(volumes[i].name, volume->name) == 0;
+	free(volumes);
+	return !there;
+}
+
 /* Whether what failed is worth another try. */
 static bool complain(struct job *job, const struct task *task, const struct error *err)
 {
@@ -254,7 +268,8 @@ static bool carry_out(struct digester *digester, const struct task *task)
 	for (int i = 0; i < count; i++) {
 		if (volumes[i].hashed || (task->name[0] != '\0' && strcmp(task->name, volumes[i].name) != 0))
 			continue;
-		if (make_digest(digester, job, volumes, count, &volumes[i], &err) != 0)
+		if (make_digest(digester, job, volumes, count, &volumes[i], &err) != 0 &&
+		    (err.code != ERR_IO || !is_void(jobs_store(digester->jobs), task->job, &volumes[i])))
 			again |= complain(job, task, &err);
 	}
 	free(volumes);

@@ -67,6 +67,12 @@ static struct job_rate *rate_of(struct jobs *jobs, const struct recipe *recipe, 
 	return NULL;
 }
 
+/* What finding the views' poses takes is no stage's work; the share that is done tells. */
+static bool refines(const struct recipe *recipe)
+{
+	return recipe->refine.geometry || recipe->refine.motion;
+}
+
 void job_measure(struct job *job, const struct job_record *record)
 {
 	const struct recipe *recipe = &job->request.recipe;
@@ -76,7 +82,8 @@ void job_measure(struct job *job, const struct job_record *record)
 	/* Of a lost run, or of one that went along with the acquisition, the times are not those of the work. */
 	const bool plain = record->attempts == 1 && record->started - record->queued > not_queued;
 
-	if (job->unreadable.code != 0 || record->state != JOB_SUCCEEDED || job->extent.views == 0 || !plain)
+	if (job->unreadable.code != 0 || record->state != JOB_SUCCEEDED || job->extent.views == 0 || !plain ||
+	    refines(recipe))
 		return;
 	work_of(recipe, &job->extent, record->iteration, work);
 	for (enum stage stage = 0; stage < STAGE_COUNT; stage++) {
@@ -98,7 +105,7 @@ static double whole(struct job *job)
 	const struct recipe *recipe = &job->request.recipe;
 	double work[STAGE_COUNT], seconds = 0;
 
-	if (job->unreadable.code != 0 || job->extent.views == 0 ||
+	if (job->unreadable.code != 0 || job->extent.views == 0 || refines(recipe) ||
 	    (recipe->algorithm != NULL && recipe->iterate.automatic))
 		return NAN;
 	work_of(recipe, &job->extent, recipe->algorithm != NULL ? recipe->iterate.iterations : 0, work);

@@ -163,7 +163,20 @@ static double distance(const struct geometry *truth, const struct geometry *said
 struct found {
 	struct refinement refinement;
 	double before, after; /* mm */
+	double share;         /* of the work, as it was told last */
+	int told;             /* how often it was */
 };
+
+/* What is told of the work grows with each step. */
+static void note_share(void *context, double share)
+{
+	struct found *found = context;
+
+	ck_assert_double_gt(share, found->share);
+	ck_assert_double_lt(share, found->share + 0.1);
+	found->share = share;
+	found->told++;
+}
 
 /* A sway of the detector along its columns and rows that no common motion explains, `sway` mm; a turn of the head. */
 static struct found find(double sway, double nod)
@@ -174,7 +187,8 @@ static struct found find(double sway, double nod)
 	struct geometry said, truth, refined;
 	struct reduced reduced;
 	struct orbit orbit;
-	struct found found;
+	struct found found = {.told = 0};
+	const struct refine_watch watch = {.progress = note_share, .context = &found};
 	struct error err;
 
 	ck_assert_int_eq(arm_nominal_geometry(&arm, &said, &err), 0);
@@ -197,7 +211,7 @@ static struct found find(double sway, double nod)
 	ck_assert_int_eq(reduced_open(&reduced, &said, &orbit, REFINE_VIEWS_MOST, REFINE_BINS_MOST, &err), 0);
 	for (int k = 0; k < VIEWS; k++)
 		reduced_take(&reduced, k, projections + (size_t)k * COLUMNS * ROWS);
-	ck_assert_msg(refine_find(&reduced, &orbit, nod != 0 ? REFINE_MOTION : REFINE_GEOMETRY, WATER, NULL,
+	ck_assert_msg(refine_find(&reduced, &orbit, nod != 0 ? REFINE_MOTION : REFINE_GEOMETRY, WATER, &watch,
 				  &found.refinement, &err) == 0,
 		      "%s", err.text);
 	for (int k = 0; k < VIEWS; k++) {
@@ -206,6 +220,8 @@ static struct found find(double sway, double nod)
 		path_motion(&found.refinement.path, refine_place(&orbit, k), &said.views[k], motion);
 		refined.views[k] = view_of_moved(&said.views[k], motion);
 	}
+	ck_assert_double_eq_tol(found.share, 1, 1e-12);
+	ck_assert_int_gt(found.told, 30);
 	found.before = distance(&truth, &said);
 	found.after = distance(&truth, &refined);
 	reduced_clear(&reduced);
