@@ -204,6 +204,23 @@ int scatter_file_lose(const struct scatter_file *file, int image, struct error *
 	return code == 0 ? put_record(file, image, &sum, err) : code;
 }
 
+int scatter_file_forget(const struct scatter_file *file, const unsigned char *flags, struct error *err)
+{
+	const off_t bytes = (off_t)scatter_image_bytes(&file->images);
+	const struct sum never = {.bytes = 0};
+	int code = 0;
+
+	for (int i = 0; i < file->count && code == 0; i++)
+		if (flags[i])
+			code = sums_put(file->sums, i, &never, err);
+	if (code == 0 && fdatasync(file->sums) != 0)
+		code = error_set_sync(err, errno, "sync " SUMS_SCATTER_FILE);
+	for (int i = 0; i < file->count && code == 0; i++)
+		if (flags[i])
+			fallocate(file->samples, FALLOC_FL_PUNCH_HOLE | FALLOC_FL_KEEP_SIZE, bytes * i, bytes);
+	return code;
+}
+
 /* ---- files that are not whole ---- */
 
 /* Into new records, in which all images are lost so far: those of the old file that are good, and images that never

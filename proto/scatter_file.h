@@ -54,5 +54,7 @@ int scatter_file_read(const struct scatter_file *file, int image, float *ret_ima
 int scatter_file_write(const struct scatter_file *file, int image, const float *pixels, struct error *err);
 /* Its record says that it is damaged, behind this. */
 int scatter_file_lose(const struct scatter_file *file, int image, struct error *err);
+/* Those with flags[count] are as if they had never come, and take no room where the file system can do that. */
+int scatter_file_forget(const struct scatter_file *file, const unsigned char *flags, struct error *err);
 
 #endif

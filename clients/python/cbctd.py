@@ -509,6 +509,10 @@ class Client:
         body = self._request("GET", f"/v1/scans/{scan}/scatter/{int(view)}").content
         return np.frombuffer(body, dtype=_FLOAT32).reshape(scatter["rows"], scatter["columns"])
 
+    def delete_scatter(self, scan: str, view: int | None = None) -> None:
+        """Removes the image of a view's scatter, or all of them, so that others can be put."""
+        self._delete(f"/v1/scans/{scan}/scatter" + ("" if view is None else f"/{int(view)}"))
+
     def delete_image(self, scan: str, name: str) -> None:
         """Removes the image ``flat``, ``dark`` or ``defects``, so that another one can be sent; `Problem` 409 while a job
         runs with it."""

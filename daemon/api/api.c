@@ -42,6 +42,8 @@ const struct route api_routes[] = {
     {"POST", "/v1/scans/{}/complete", ROLE_ACQUIRE, scan_complete, BODY_NONE, 0, NULL, NULL, NULL},
     IMAGES(IMAGE_ROUTE) // one for each
     {"GET", "/v1/scans/{}/scatter/{}", ROLE_VIEW, scatter_get, BODY_NONE, 0, NULL, NULL, NULL},
+    {"DELETE", "/v1/scans/{}/scatter", ROLE_ACQUIRE, scatter_delete_all, BODY_NONE, 0, NULL, NULL, NULL},
+    {"DELETE", "/v1/scans/{}/scatter/{}", ROLE_ACQUIRE, scatter_delete, BODY_NONE, 0, NULL, NULL, NULL},
     {"PUT", "/v1/scans/{}/scatter/{}", ROLE_ACQUIRE, projections_put, BODY_STREAM, 0, scatter_begin, upload_take, NULL},
     {"PUT", "/v1/scans/{}/projections", ROLE_ACQUIRE, projections_put, BODY_STREAM, 0, projections_begin, upload_take,
      NULL},

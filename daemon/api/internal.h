@@ -28,6 +28,8 @@ int projections_begin(void *context, struct request *request, struct error *err)
 int image_begin(void *context, struct request *request, struct error *err);
 int scatter_begin(void *context, struct request *request, struct error *err);
 int scatter_get(void *context, struct request *request, struct error *err);
+int scatter_delete(void *context, struct request *request, struct error *err);
+int scatter_delete_all(void *context, struct request *request, struct error *err);
 int image_delete(void *context, struct request *request, struct error *err);
 int upload_take(void *context, struct request *request, const void *data, size_t size, size_t *ret_taken,
 		struct error *err);

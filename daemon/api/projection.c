@@ -84,6 +84,15 @@ int image_begin(void *context, struct request *request, struct error *err)
 	return begin(api, request, scan, &target, err);
 }
 
+static int scatter_announced(const struct scan *scan, struct error *err)
+{
+	return scan->scatter.images.columns != 0
+		   ? 0
+		   : error_set(err, ERR_CONFLICT,
+			       "the scan announces no images of scatter, as {\"kind\": \"images\"} in its member "
+			       "projections.scatter would");
+}
+
 /* The image of scatter that the request's path names by its projection. */
 static int scatter_asked(struct request *request, const struct scan *scan, int *ret_image, struct error *err)
 {
@@ -91,10 +100,8 @@ static int scatter_asked(struct request *request, const struct scan *scan, int *
 	const char *text = request_argument(request, 1);
 	long projection;
 
-	if (images->columns == 0)
-		return error_set(err, ERR_CONFLICT,
-				 "the scan announces no images of scatter, as {\"kind\": \"images\"} in its member "
-				 "projections.scatter would");
+	if (scatter_announced(scan, err) != 0)
+		return err->code;
 	if (!index_parse(text, strlen(text), scan->count - 1, &projection))
 		return error_set(err, ERR_NOT_FOUND, "projection \"%.40s\" is asked for, the scan has 0 to %d", text,
 				 scan->count - 1);
@@ -165,6 +172,32 @@ int image_delete(void *context, struct request *request, struct error *err)
 	code = jobs_remove_image(api->jobs, scan, image, err);
 	stored_scan_release(scan);
 	return code != 0 ? code : request_reply_empty(request, 204, err);
+}
+
+/* The image of scatter that the path names, or all of them. */
+static int delete_scatter(struct api *api, struct request *request, bool all, struct error *err)
+{
+	struct stored_scan *scan;
+	int image = -1, code;
+
+	if (store_scan_find(api->store, request_argument(request, 0), &scan, err) != 0)
+		return err->code;
+	code = all ? scatter_announced(stored_scan_parsed(scan), err)
+		   : scatter_asked(request, stored_scan_parsed(scan), &image, err);
+	if (code == 0)
+		code = jobs_remove_scatter(api->jobs, scan, image, err);
+	stored_scan_release(scan);
+	return code != 0 ? code : request_reply_empty(request, 204, err);
+}
+
+int scatter_delete(void *context, struct request *request, struct error *err)
+{
+	return delete_scatter(context, request, false, err);
+}
+
+int scatter_delete_all(void *context, struct request *request, struct error *err)
+{
+	return delete_scatter(context, request, true, err);
 }
 
 /* ---- out ---- */

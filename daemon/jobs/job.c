@@ -573,62 +573,6 @@ int jobs_delete(struct jobs *jobs, struct job *job, bool *ret_removed, struct er
 	return 0;
 }
 
-/* A job over the scan for which `uses` holds, "" for none. With jobs.change held, so that the answer lasts. */
-static void find_user(struct jobs *jobs, const char *scan, bool (*uses)(enum job_state state), char ret_user[ID_SIZE])
-{
-	ret_user[0] = '\0';
-	pthread_mutex_lock(&jobs->lock);
-	for (int i = 0; i < jobs->count && ret_user[0] == '\0'; i++) {
-		if (uses(jobs->all[i]->record.state) && strcmp(jobs->all[i]->scan, scan) == 0)
-			memcpy(ret_user, jobs->all[i]->id, ID_SIZE);
-	}
-	pthread_mutex_unlock(&jobs->lock);
-}
-
-static bool has_not_ended(enum job_state state)
-{
-	return !job_state_ended(state);
-}
-
-static bool runs(enum job_state state)
-{
-	return state == JOB_RUNNING;
-}
-
-int jobs_delete_scan(struct jobs *jobs, struct stored_scan *scan, struct error *err)
-{
-	const char *id = stored_scan_id(scan);
-	char user[ID_SIZE];
-	int code;
-
-	pthread_mutex_lock(&jobs->change);
-	find_user(jobs, id, has_not_ended, user);
-	if (user[0] != '\0')
-		code = error_set(err, ERR_CONFLICT, "job %s still uses scan %s", user, id);
-	else
-		code = store_scan_delete(jobs->store, scan, err);
-	pthread_mutex_unlock(&jobs->change);
-	if (code == 0)
-		store_scan_remove_files(jobs->store, id);
-	return code;
-}
-
-int jobs_remove_image(struct jobs *jobs, struct stored_scan *scan, enum image image, struct error *err)
-{
-	char user[ID_SIZE];
-	int code;
-
-	pthread_mutex_lock(&jobs->change);
-	find_user(jobs, stored_scan_id(scan), runs, user);
-	if (user[0] != '\0')
-		code = error_set(err, ERR_CONFLICT, "job %s runs with the %s of scan %s", user,
-				 image_kinds[image].title, stored_scan_id(scan));
-	else
-		code = store_remove_image(jobs->store, scan, image, err);
-	pthread_mutex_unlock(&jobs->change);
-	return code;
-}
-
 void job_facts(struct job *job, struct job_facts *ret)
 {
 	pthread_mutex_lock(&job->jobs->lock);

@@ -88,6 +88,8 @@ int job_pin(struct job *job, bool pinned, struct error *err);
 int jobs_delete_scan(struct jobs *jobs, struct stored_scan *scan, struct error *err);
 /* Removes an image of a scan. ERR_CONFLICT, naming the job, while one that runs uses the scan. */
 int jobs_remove_image(struct jobs *jobs, struct stored_scan *scan, enum image image, struct error *err);
+/* The same of an image of scatter, or of all (-1); also while one has begun that goes on later. */
+int jobs_remove_scatter(struct jobs *jobs, struct stored_scan *scan, int image, struct error *err);
 
 /* Woken at each change of state and each new event of this job, or of any; not at mere progress. See watch.h. */
 void job_watch(struct job *job, struct watch *watch);

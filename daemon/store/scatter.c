@@ -351,6 +351,10 @@ static int claim(struct stored_scan *scan, int image, bool *ret_there, struct er
 		code = error_set(err, ERR_NOT_FOUND, "scan %s was deleted meanwhile", scan->id);
 	else if (scan->scatter_progress[image] == CLAIMED)
 		code = error_set(err, ERR_BUSY, "another request is writing this image");
+	else if (!*ret_there && !is_needed(scan, image) && !scan->scatter_lost[image])
+		code =
+		    error_set(err, ERR_CONFLICT, "the scan was completed without projection %d, whose scatter this is",
+			      scatter_image_projection(&scan->scatter, scan->count, image));
 	else if (!*ret_there)
 		scan->scatter_progress[image] = CLAIMED;
 	pthread_mutex_unlock(&scan->lock);
@@ -443,5 +447,90 @@ int store_put_scatter(struct stored_scan *scan, int image, const float *pixels, 
 		pthread_mutex_unlock(&scan->lock);
 	}
 	set_progress(scan, image, code == 0 ? STORED : MISSING);
+	return code;
+}
+
+/* ---- removal ---- */
+
+static bool is_there(const struct stored_scan *scan, int image)
+{
+	return scan->scatter_progress[image] == STORED || scan->scatter_lost[image];
+}
+
+/* ret_flags[]: which are to go; nobody else writes them until then. */
+static int claim_removal(struct stored_scan *scan, int image, unsigned char *ret_flags, struct error *err)
+{
+	const int first = image < 0 ? 0 : image, end = image < 0 ? scan->scatter_count : image + 1;
+	int count = 0, code = 0;
+
+	pthread_mutex_lock(&scan->lock);
+	if (scan->deleted)
+		code = error_set(err, ERR_NOT_FOUND, "scan %s was deleted meanwhile", scan->id);
+	for (int i = first; i < end && code == 0; i++) {
+		if (scan->scatter_progress[i] == CLAIMED)
+			code = error_set(err, ERR_BUSY, "another request is writing this image");
+		ret_flags[i] = is_there(scan, i);
+		count += ret_flags[i];
+	}
+	if (code == 0 && count == 0)
+		code = error_set(err, ERR_NOT_FOUND, "%s",
+				 image < 0 ? "the scan has no image of its scatter"
+					   : "the scan has no such image of its scatter");
+	for (int i = first; i < end && code == 0; i++)
+		if (ret_flags[i])
+			scan->scatter_progress[i] = CLAIMED;
+	pthread_mutex_unlock(&scan->lock);
+	return code;
+}
+
+static int forget(struct stored_scan *scan, const unsigned char *flags, struct error *err)
+{
+	struct scatter_file file;
+	bool whole;
+	int code;
+
+	pthread_mutex_lock(&scan->scatter_files);
+	code = open_file(scan, true, &file, &whole, err);
+	if (code == 0) {
+		code = file.sums < 0 || !whole ? error_set(err, ERR_NOT_FOUND, SUMS_SCATTER_FILE " is not whole")
+					       : scatter_file_forget(&file, flags, err);
+		scatter_file_close(&file);
+	}
+	pthread_mutex_unlock(&scan->scatter_files);
+	return code;
+}
+
+int store_remove_scatter(struct stored_scan *scan, int image, struct error *err)
+{
+	unsigned char *flags = calloc((size_t)scan->scatter_count, 1);
+	int code;
+
+	if (flags == NULL)
+		return error_set_errno(err, ENOMEM, "list of %d images", scan->scatter_count);
+	code = claim_removal(scan, image, flags, err);
+	if (code != 0)
+		goto out;
+	code = forget(scan, flags, err);
+	if (are_not_whole(code)) {
+		code = mend_and_check(scan, err);
+		if (code == 0)
+			code = forget(scan, flags, err);
+	}
+	pthread_mutex_lock(&scan->lock);
+	for (int i = 0; i < scan->scatter_count; i++) {
+		if (!flags[i])
+			continue;
+		/* What could not be removed is lost: the next who sends one puts it in its place. */
+		scan->scatter_progress[i] = MISSING;
+		scan->scatter_lost[i] = code != 0;
+	}
+	scan->losses++; /* who has begun with it begins anew */
+	pthread_mutex_unlock(&scan->lock);
+	if (code != 0)
+		store_distrust(scan->store, err);
+	watch_wake(&scan->watchers);
+	watch_wake(&scan->store->arrivals);
+out:
+	free(flags);
 	return code;
 }

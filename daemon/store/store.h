@@ -379,9 +379,12 @@ int store_remove_image(struct store *store, struct stored_scan *scan, enum image
 
 /*
  * An image of scatter (core/detector.h), by its own number. As of an image of the detector, but that another one is not
- * taken in place of one that is there.
+ * taken in place of one that is there, and that one of a projection that the scan was completed without is refused
+ * (ERR_CONFLICT).
  */
 int store_put_scatter(struct stored_scan *scan, int image, const float *pixels, bool *ret_new, struct error *err);
+/* Removes it, or all that are there (-1), as if it had never come: as store_remove_image has it. */
+int store_remove_scatter(struct stored_scan *scan, int image, struct error *err);
 /* ERR_NOT_FOUND: it is not stored. ERR_DAMAGED: it is lost now. */
 int store_read_scatter(struct stored_scan *scan, int image, float *ret_pixels, struct sum *ret_sum, struct error *err);
 /* flags[count]: 1 where the image is stored. */

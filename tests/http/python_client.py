@@ -172,6 +172,10 @@ class Scans(Case):
         self.assertEqual(self.client.scan(scan)["scatter"]["missing"], [0, 50, 59])
         with self.assertRaises(ValueError):
             self.client.put_scatter(scan, 0, np.zeros(shape[1:]))
+        self.client.delete_scatter(scan, 25)
+        self.assertTrue(self.client.put_scatter(scan, 25, image + 1))
+        self.client.delete_scatter(scan)
+        self.assertEqual(self.client.scan(scan)["scatter"]["received_count"], 0)
 
     def test_every_kind_of_geometry(self) -> None:
         angles = np.deg2rad(self.scan_json["geometry"]["angle_step_deg"] * np.arange(60))

@@ -137,6 +137,65 @@ test_an_image_comes_back_and_is_checked() {
 	expect_json '.detail | contains("announces no images")'
 }
 
+test_an_image_is_removed_and_another_put() {
+	local k right uploaded
+	uploaded=$(cbct upload --quiet --url "$url" "$work/images")
+	scan=$uploaded
+	post_job "$recipe"
+	wait_job succeeded
+	right=$(digest)
+	post_scan "$work/images"
+	put_image 10
+	req DELETE "/v1/scans/$scan/scatter/20"
+	expect_problem 404
+	req DELETE "/v1/scans/$scan/scatter/11"
+	expect_problem 404
+	req DELETE "/v1/scans/$scan/scatter/10"
+	expect_status 204
+	req GET "/v1/scans/$scan/scatter/10"
+	expect_problem 404
+	expect_json '.detail | contains("not been stored yet")'
+	image_of 20
+	req PUT "/v1/scans/$scan/scatter/10" --data-binary @"$work/image.raw"
+	expect_status 201
+	for k in 0 20 30 40 44; do put_image $k; done
+	# A job that has begun with views as they came begins anew, and has the bits of the images that are there in the end.
+	post_job "$recipe"
+	for k in $(seq 0 43); do put_one "$k"; done
+	req DELETE "/v1/scans/$scan/scatter/10"
+	expect_status 204
+	put_one 44
+	waits_for_scatter
+	put_image 10
+	expect_status 201
+	wait_job succeeded
+	[ "$(digest)" = "$right" ] || fail "the bits of a scan whose images were right at once"
+	req DELETE "/v1/scans/$scan/scatter"
+	expect_status 204
+	req GET "/v1/scans/$scan"
+	expect_json '.scatter.received_count == 0 and ([.warnings[].code] | index("damaged_image") == null)'
+	req DELETE "/v1/scans/$scan/scatter"
+	expect_problem 404
+	put_image 44
+	expect_status 201
+	# not while a job needs them
+	scan=$uploaded
+	post_job '{"scan": "SCAN", "grid": {"size": [40, 40, 28], "spacing_mm": [2.6, 2.6, 2.6]}, "sart": {"iterations": 100000}, "tv": null}'
+	until req GET "/v1/jobs/$job" && jq -e '.iteration >= 1' "$body" >/dev/null; do sleep 0.05; done
+	for k in scatter/10 scatter; do
+		req DELETE "/v1/scans/$scan/$k"
+		expect_problem 409
+		expect_json ".detail | contains(\"job $job has begun\")"
+	done
+	req DELETE "/v1/jobs/$job"
+	wait_job cancelled
+	req DELETE "/v1/scans/$scan/scatter/10"
+	expect_status 204
+	post_scan "$work/good"
+	req DELETE "/v1/scans/$scan/scatter"
+	expect_problem 409
+}
+
 # Views 35 to 44 never come: their images are waited for no more, and views behind 30 have that of 30.
 test_a_scan_that_is_broken_off_wants_the_images_of_its_views() {
 	local k
@@ -147,9 +206,14 @@ test_a_scan_that_is_broken_off_wants_the_images_of_its_views() {
 	req POST "/v1/scans/$scan/complete"
 	expect_status 200
 	waits_for_scatter
+	put_image 40
+	expect_problem 409
+	expect_json '.detail | contains("completed without projection 40")'
 	put_image 30
 	expect_status 201
 	wait_job succeeded
+	put_image 44
+	expect_problem 409
 }
 
 # $1: which images, FROM TO; $2: what happens to their pixel 10, 8, or with "block" to four, or with "all" to all of them
