@@ -44,6 +44,10 @@ const struct warning_kind warning_kinds[] = {
     {"geometry_wrong", SEVERITY_SERIOUS,
      "The projections do not fit each other: the arm stood elsewhere than the scan says, or the patient moved; the "
      "image may be wrong."},
+    {"other_direction", SEVERITY_SERIOUS,
+     "The arm turned the other way than the scan says, or the projections are mirrored: left and right are exchanged "
+     "in "
+     "the image, and shapes are wrong."},
     /* ---- of a calibration, and of a scan that uses one ---- */
     {"calibration_interpolated", SEVERITY_INFO,
      "The arm's places in this scan are interpolated between those that were calibrated."},

@@ -3,6 +3,7 @@
  * once all have come (core/refine/agreement.h). It works in the host's memory and on its processor, whatever the device
  * is: the scan is small by then.
  */
+#include <math.h>
 #include <stdlib.h>
 
 #include "core/correct/correction.h"
@@ -80,11 +81,41 @@ static int take_view(const struct correction_job *job, void *opaque, const struc
 	return code;
 }
 
+/* Views that opposite ones contradict, whatever the object is. */
+static bool tell_opposite(const struct correction_job *job, const struct opposite_rays *rays, double bin)
+{
+	const double given = sqrt(rays->square[OPPOSITE_GIVEN]);
+
+	if (opposite_rays_other_way(rays))
+		warning_tell(
+		    job->warnings, "other_direction",
+		    "line integrals of the %d rays that two views share differ by %.2g (root mean square) as the "
+		    "geometry "
+		    "says, and by %.2g if the arm turned the other way or the columns of the projections are mirrored",
+		    rays->pairs[OPPOSITE_GIVEN], given,
+		    sqrt(fmin(rays->square[OPPOSITE_OTHER_WAY], rays->square[OPPOSITE_MIRRORED])));
+	else if (opposite_rays_displaced(rays))
+		warning_tell(job->warnings, "geometry_wrong",
+			     "line integrals of the %d rays that two views share differ by %.2g (root mean square) as "
+			     "the geometry says, and by %.2g if the detector is displaced to the other side",
+			     rays->pairs[OPPOSITE_GIVEN], given, sqrt(rays->square[OPPOSITE_OTHER_SIDE]));
+	else if (opposite_rays_aside(rays))
+		warning_tell(job->warnings, "geometry_wrong",
+			     "line integrals of the %d rays that two views share differ by %.2g (root mean square) as "
+			     "the geometry says, and by %.2g if all detectors stand aside by %.3g mm at the isocentre, "
+			     "along %ss",
+			     rays->pairs[OPPOSITE_GIVEN], given, sqrt(rays->least), rays->aside * bin,
+			     job->input->turned ? "column" : "row");
+	else
+		return false;
+	return true;
+}
+
 static void tell(const struct correction_job *job, const struct agreement *agreement, double bin)
 {
 	const enum agreement_grade grade = agreement_grade(agreement, bin);
 
-	if (grade == AGREEMENT_GOOD)
+	if (grade == AGREEMENT_GOOD || tell_opposite(job, &agreement->rays, bin))
 		return;
 	warning_tell(job->warnings, grade == AGREEMENT_WRONG ? "geometry_wrong" : "geometry_doubtful",
 		     "views lie aside of what the others show by %.2g mm at the isocentre (root mean square over %d "
@@ -114,8 +145,8 @@ static int warn(const struct correction_job *job, void *opaque, struct error *er
 	code = agreement_measure(&state->reduced, job->cancel, &agreement, err);
 	if (code < 0)
 		return code;
+	tell(job, &agreement, reduced_bin(&state->reduced, job->orbit));
 	if (agreement_is_known(&agreement)) {
-		tell(job, &agreement, reduced_bin(&state->reduced, job->orbit));
 		job->agreement->mm = agreement.mm;
 		job->agreement->sigma_mm = agreement.sigma_mm;
 		job->agreement->unexplained = agreement.unexplained;

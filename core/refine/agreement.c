@@ -298,6 +298,25 @@ static void summarise(struct agreement *agreement, const struct reduced *reduced
 	agreement->unexplained = median_unexplained(agreement, reduced->geometry.count);
 }
 
+/* True if the object goes beyond the first or the last column on more rows than those of a table or an arm. */
+static bool is_cut(const struct reduced *reduced)
+{
+	const double outside = 0.1, few = 0.05; /* of the largest line integral, of the rows */
+	const int columns = reduced->geometry.columns;
+	const size_t rows = (size_t)reduced->geometry.count * (size_t)reduced->geometry.rows;
+	float most = 0;
+	size_t cut = 0;
+
+	for (size_t i = 0; i < rows * (size_t)columns; i++)
+		most = fmaxf(most, reduced->projections[i]);
+	for (size_t i = 0; i < rows; i++) {
+		const float *row = reduced->projections + i * (size_t)columns;
+
+		cut += (double)fmaxf(row[0], row[columns - 1]) > outside * (double)most;
+	}
+	return (double)cut > few * (double)rows;
+}
+
 int agreement_measure(const struct reduced *reduced, const struct cancel *cancel, struct agreement *ret_agreement,
 		      struct error *err)
 {
@@ -321,7 +340,11 @@ int agreement_measure(const struct reduced *reduced, const struct cancel *cancel
 	if (code == 0)
 		code = compare_views(&half, made, agreement.views, err);
 	if (code == 0)
+		code = opposite_rays_compare(reduced, half.orbit.frame[2], &agreement.rays, err);
+	if (code == 0) {
 		summarise(&agreement, reduced);
+		agreement.cut = is_cut(reduced);
+	}
 	half_clear(&half);
 	free(made);
 	free(picture);
@@ -343,7 +366,10 @@ enum agreement_grade agreement_grade(const struct agreement *agreement, double b
 	/* mm^2 is the mean square without that of sigma. */
 	const double raw = hypot(agreement->mm, agreement->sigma_mm);
 
-	if (agreement_is_known(agreement) && agreement->unexplained > UNEXPLAINED)
+	if (opposite_rays_other_way(&agreement->rays))
+		return AGREEMENT_OTHER_WAY;
+	if (opposite_rays_displaced(&agreement->rays) || opposite_rays_aside(&agreement->rays) ||
+	    (agreement_is_known(agreement) && agreement->unexplained > UNEXPLAINED && !agreement->cut))
 		return AGREEMENT_WRONG;
 	if (!agreement_is_known(agreement) || agreement->mm < DOUBTFUL * bin ||
 	    raw < BEYOND_SIGMA * agreement->sigma_mm)

@@ -2,6 +2,7 @@
 #define CBCT_CORE_AGREEMENT_H
 
 #include "core/backend.h"
+#include "core/refine/opposite.h"
 #include "core/refine/reduced.h"
 
 /*
@@ -22,7 +23,11 @@
  * What all views share, such as an object that stands elsewhere, is no disagreement and does not count. Neither does a
  * slow departure that a short scan's views share with all those beside them and that no opposite view contradicts. A
  * departure of more than some bins is no small shift: then the views' detail is not where the others show it, and the
- * share of it that is unexplained tells.
+ * share of it that is unexplained tells. Not so where the object is wider than the detector: what is beyond the field
+ * of view is in no half's volume, and its detail stays unexplained by any geometry.
+ *
+ * Large departures of all views, an arm that turned the other way and a detector far aside, are told by the rays that
+ * opposite views have in common (opposite.h), which need no volume.
  */
 enum { AGREEMENT_VIEWS_MOST = 120, AGREEMENT_BINS_MOST = 80 };
 
@@ -40,6 +45,8 @@ struct agreement {
 	double unexplained; /* median of the views' shares */
 	int worst;          /* number of the view, in the scan, that lies aside most */
 	double worst_mm;
+	bool cut; /* the object is wider than the detector: nothing follows from what is unexplained */
+	struct opposite_rays rays;
 	struct view_agreement *views; /* [reduced.geometry.count], owned */
 };
 
@@ -60,7 +67,7 @@ bool agreement_is_known(const struct agreement *agreement);
  * photons a bin, short scans and full turns, and hold on others of these that they were not found on
  * (tests/bench/results/agreement.txt).
  */
-enum agreement_grade { AGREEMENT_GOOD, AGREEMENT_DOUBTFUL, AGREEMENT_WRONG };
+enum agreement_grade { AGREEMENT_GOOD, AGREEMENT_DOUBTFUL, AGREEMENT_WRONG, AGREEMENT_OTHER_WAY };
 enum agreement_grade agreement_grade(const struct agreement *agreement, double bin);
 
 #endif

@@ -52,6 +52,19 @@ test_a_job_tells_whether_the_geometry_fits() {
 	done
 }
 
+# The same projections, said to be those of an arm that turned the other way: on part of a circle, too.
+test_a_job_tells_that_the_arm_turned_the_other_way() {
+	cbct simulate --phantom asymmetric --scale 70 --density 0.0192 --views 64 --arc 200 --columns 80 --rows 64 --pixel 4.8 \
+		--source-to-isocentre 620 --source-to-detector 1100 -o "$work/turned" >/dev/null || fail "cbct simulate"
+	jq '.geometry.angle_step_deg |= -.' "$work/turned/scan.json" >"$work/turned.json" && mv "$work/turned.json" "$work/turned/scan.json"
+	post_scan "$work/turned"
+	post_projections "$work/turned"
+	post_job '{"scan": "SCAN", "grid": {"size": [24, 24, 16], "spacing_mm": [6, 6, 6]}, "fdk": {}}'
+	wait_job succeeded
+	expect_json '[.warnings[] | select(.code == "other_direction" and .severity == "serious")] | length == 1'
+	expect_json '.warnings | all(.code != "geometry_wrong" and .code != "geometry_doubtful")'
+}
+
 test_quality_is_that_which_numpy_finds() {
 	"$python" -c 'import numpy' 2>/dev/null || skip "numpy is not here"
 	made clean

@@ -222,6 +222,142 @@ START_TEST(a_detector_that_stands_far_aside_is_told)
 }
 END_TEST
 
+/* The arm turned the other way than `said`, which a detector with columns mirrored looks like as well. */
+static struct geometry other_way(const struct arm *arm)
+{
+	struct arm other = *arm;
+
+	other.step = -arm->step;
+	return circle_of(&other);
+}
+
+/* What opposite views say of a scan whose geometry is `said`. */
+static struct opposite_rays rays_of(const struct geometry *said, const float *projections)
+{
+	const size_t pixels = (size_t)said->columns * (size_t)said->rows;
+	struct opposite_rays rays;
+	struct orbit orbit;
+	struct reduced reduced;
+	struct error err;
+
+	ck_assert_int_eq(orbit_analyse(&orbit, said, &err), 0);
+	ck_assert_int_eq(reduced_open(&reduced, said, &orbit, AGREEMENT_VIEWS_MOST, AGREEMENT_BINS_MOST, &err), 0);
+	for (int k = 0; k < said->count; k++)
+		reduced_take(&reduced, k, projections + (size_t)k * pixels);
+	ck_assert_int_eq(opposite_rays_compare(&reduced, orbit.frame[2], &rays, &err), 0);
+	reduced_clear(&reduced);
+	orbit_clear(&orbit);
+	return rays;
+}
+
+/* Short scans, too, whose views all fit those beside them; and truncated bodies. */
+START_TEST(an_arm_that_turned_the_other_way_is_told)
+{
+	static const double arcs[] = {200, 360};
+	const struct arm arm = arm_of(arcs[_i % 2]);
+	float *projections = take(&arm, (enum scene_kind)(_i / 2), 20000);
+	struct geometry right = circle_of(&arm), wrong = other_way(&arm);
+	const struct opposite_rays of_right = rays_of(&right, projections), of_wrong = rays_of(&wrong, projections);
+
+	ck_assert(!opposite_rays_other_way(&of_right) && !opposite_rays_aside(&of_right));
+	ck_assert(opposite_rays_other_way(&of_wrong));
+	geometry_clear(&right);
+	geometry_clear(&wrong);
+	free(projections);
+}
+END_TEST
+
+/* Detectors displaced by 60 mm: what was taken, and said to be, on the other side or the other way round. */
+START_TEST(a_displaced_detector_is_told_from_one_on_the_other_side)
+{
+	const struct arm arm = arm_of(360);
+	const size_t pixels = (size_t)COLUMNS * ROWS;
+	struct geometry said[] = {circle_of(&arm), other_way(&arm), circle_of(&arm)};
+	float *projections = malloc(VIEWS * pixels * sizeof(*projections));
+	struct body body;
+	struct opposite_rays rays[3];
+
+	ck_assert_ptr_nonnull(projections);
+	make_body(&body, SKULL);
+	body.parts[0].centre[0] = body.parts[1].centre[0] = 30;
+	for (int which = 0; which < 3; which++)
+		for (int k = 0; k < VIEWS; k++)
+			for (int a = 0; a < 3; a++) {
+				struct view *view = &said[which].views[k];
+
+				view->pixel0[a] += (which == 2 ? -60 : 60) / PIXEL * view->column_step[a];
+			}
+	for (int k = 0; k < VIEWS; k++)
+		phantom_project(&(struct phantom){.count = body.count, .parts = body.parts}, &said[0], k,
+				projections + (size_t)k * pixels);
+	for (int which = 0; which < 3; which++) {
+		rays[which] = rays_of(&said[which], projections);
+		geometry_clear(&said[which]);
+	}
+	ck_assert(!opposite_rays_other_way(&rays[0]) && !opposite_rays_displaced(&rays[0]));
+	ck_assert(opposite_rays_other_way(&rays[1]) && !opposite_rays_displaced(&rays[1]));
+	ck_assert(!opposite_rays_other_way(&rays[2]) && opposite_rays_displaced(&rays[2]));
+	free(projections);
+}
+END_TEST
+
+/* A ball on the axis looks the same either way: nothing can be known, and nothing is said. */
+START_TEST(a_ball_on_the_axis_turns_either_way)
+{
+	const struct arm arm = arm_of(360);
+	const size_t pixels = (size_t)COLUMNS * ROWS;
+	struct ellipsoid ball = {.shape = SHAPE_ELLIPSOID, .semi_axes = {70, 70, 60}, .density = WATER};
+	float *projections = malloc(VIEWS * pixels * sizeof(*projections));
+	struct geometry taken = circle_of(&arm), said = other_way(&arm);
+	struct opposite_rays rays;
+
+	ck_assert_ptr_nonnull(projections);
+	for (int k = 0; k < VIEWS; k++)
+		phantom_project(&(struct phantom){.count = 1, .parts = &ball}, &taken, k,
+				projections + (size_t)k * pixels);
+	rays = rays_of(&said, projections);
+	ck_assert(rays.pairs[OPPOSITE_GIVEN] > 0 && !opposite_rays_other_way(&rays));
+	geometry_clear(&taken);
+	geometry_clear(&said);
+	free(projections);
+}
+END_TEST
+
+static const struct {
+	double aside; /* mm, at the isocentre */
+	double sag;
+	bool fits;
+} cuts[] = {{0, 0, true}, {1.5, 0, false}, {18, 0, false}, {0, 1, false}};
+
+/* What is beyond a narrow detector is no detail that the other views could show: the head on its circle is no defect.
+ */
+START_TEST(a_truncated_head_is_accused_of_no_more_than_is_wrong)
+{
+	enum { NARROW = 46 };
+	struct arm arm = arm_of(360);
+	struct geometry said;
+	struct figures found;
+	float *projections;
+
+	arm.columns = NARROW;
+	arm.count = 96;
+	arm.step = 2 * M_PI / arm.count;
+	arm.sag = cuts[_i].sag;
+	projections = take(&arm, SKULL, 1e5);
+	said = circle_of(&arm);
+	for (int k = 0; k < said.count; k++)
+		for (int a = 0; a < 3; a++)
+			said.views[k].pixel0[a] += cuts[_i].aside * 1100 / 620 * said.views[k].column_step[a] / PIXEL;
+	found = check(&said, projections, false, -1);
+	ck_assert_msg((agreement_grade(&found.agreement, found.bin) == AGREEMENT_GOOD) == cuts[_i].fits,
+		      "%g mm +- %g, %g unexplained, aside by %g", found.agreement.mm, found.agreement.sigma_mm,
+		      found.agreement.unexplained, found.agreement.rays.aside);
+	agreement_clear(&found.agreement);
+	geometry_clear(&said);
+	free(projections);
+}
+END_TEST
+
 /* One view fewer and half of them are not the object: nothing is said. */
 START_TEST(sixty_four_views_are_the_least)
 {
@@ -418,6 +554,11 @@ Suite *agreement_suite(void)
 			    (int)(sizeof(departures) / sizeof(departures[0])));
 	tcase_add_loop_test(known, a_hand_that_leaves_the_rows_is_not_doubted, 0, 3);
 	tcase_add_loop_test(known, a_detector_that_stands_far_aside_is_told, 0, 3);
+	tcase_add_loop_test(known, an_arm_that_turned_the_other_way_is_told, 0, 2 * KINDS);
+	tcase_add_loop_test(known, a_displaced_detector_is_told_from_one_on_the_other_side, 0, 3);
+	tcase_add_test(known, a_ball_on_the_axis_turns_either_way);
+	tcase_add_loop_test(known, a_truncated_head_is_accused_of_no_more_than_is_wrong, 0,
+			    (int)(sizeof(cuts) / sizeof(cuts[0])));
 	tcase_add_test(known, sixty_four_views_are_the_least);
 	tcase_add_test(known, one_view_that_stands_elsewhere_is_named);
 	tcase_add_test(known, the_same_bits_in_any_order_and_by_any_number_of_threads);

@@ -1,0 +1,169 @@
+/* Rays that two views have in common: see opposite.h. */
+#include "core/refine/opposite.h"
+
+#include <math.h>
+#include <stdlib.h>
+
+enum { PAIRS_LEAST = 60, ASIDE_STEPS = 40 };
+static const double ASIDE_STEP = 0.25; /* bins */
+/* Bins from which on detectors are far aside: what an uneven flat looks like is less. */
+static const double FAR_ASIDE = 3;
+/*
+ * Times by which the differences are smaller where the other geometry is the true one: of 60 pairs and more noise alone
+ * makes 4 of it less than once in a million times. What explains nearly as much is held to be possible.
+ */
+static const double SMALLER = 4, NEARLY = 2, FAR_SMALLER = 8;
+/* The share of the integrals below which differences come from the bins' width, and say nothing. */
+static const double SHARE_LEAST = 0.005;
+
+static void mirror(double v[3], const double across[3])
+{
+	const double twice = 2 * vec_dot(v, across);
+
+	for (int i = 0; i < 3; i++)
+		v[i] -= twice * across[i];
+}
+
+static struct view view_of_case(const struct view *given, int columns, const double axis[3], enum opposite_case which)
+{
+	struct view view = *given;
+
+	if (which == OPPOSITE_OTHER_WAY || which == OPPOSITE_OTHER_SIDE) {
+		double across[3], norm;
+
+		vec_cross(axis, view.source, across);
+		norm = vec_norm(across);
+		for (int i = 0; i < 3; i++)
+			across[i] /= norm;
+		mirror(view.pixel0, across);
+		mirror(view.column_step, across);
+		mirror(view.row_step, across);
+	}
+	for (int i = 0; i < 3 && (which == OPPOSITE_MIRRORED || which == OPPOSITE_OTHER_SIDE); i++) {
+		view.pixel0[i] += (columns - 1) * view.column_step[i];
+		view.column_step[i] = -view.column_step[i];
+	}
+	return view;
+}
+
+/* The mean of three rows at a place between bins; false where it is not on the detector. */
+static bool sample(const struct reduced *reduced, int view, double column, double row, double *ret_value)
+{
+	const int columns = reduced->geometry.columns, rows = reduced->geometry.rows;
+	const float *p = reduced->projections + (size_t)view * (size_t)columns * (size_t)rows;
+	const double c = floor(column), r = floor(row), x = column - c, y = row - r;
+	double sum = 0;
+
+	if (!(c >= 0) || !(c < columns - 1) || !(r >= 1) || !(r < rows - 2))
+		return false;
+	p += (size_t)(r - 1) * (size_t)columns + (size_t)c;
+	for (int i = 0; i < 3; i++, p += columns)
+		sum += (1 - y) * ((1 - x) * (double)p[0] + x * (double)p[1]) +
+		       y * ((1 - x) * (double)p[columns] + x * (double)p[columns + 1]);
+	*ret_value = sum / 3;
+	return true;
+}
+
+/* Mean squares where detectors stand aside by so many bins. */
+struct comparison {
+	int pairs;
+	double difference, integral;
+};
+
+static struct comparison compare(const struct reduced *reduced, double (*matrices)[12], double aside)
+{
+	const struct geometry *geometry = &reduced->geometry;
+	struct comparison sums = {0};
+
+	for (int i = 0; i < geometry->count; i++)
+		for (int j = i + 1; j < geometry->count && reduced->known[i]; j++) {
+			const double *const from = geometry->views[i].source, *const to = geometry->views[j].source;
+			double column[2], row[2], value[2];
+
+			/* Neighbours see each other nowhere; opposite sources are in front of each other. */
+			if (!reduced->known[j] || vec_dot(from, to) > 0 ||
+			    !(view_project(matrices[i], to, &column[0], &row[0]) > 0) ||
+			    !(view_project(matrices[j], from, &column[1], &row[1]) > 0) ||
+			    !sample(reduced, i, column[0] + aside, row[0], &value[0]) ||
+			    !sample(reduced, j, column[1] + aside, row[1], &value[1]))
+				continue;
+			sums.difference += pow(value[0] - value[1], 2);
+			sums.integral += (pow(value[0], 2) + pow(value[1], 2)) / 2;
+			sums.pairs++;
+		}
+	if (sums.pairs < PAIRS_LEAST)
+		return (struct comparison){0};
+	sums.difference /= sums.pairs;
+	sums.integral /= sums.pairs;
+	return sums;
+}
+
+static void compare_aside(const struct reduced *reduced, double (*matrices)[12], struct opposite_rays *rays)
+{
+	rays->least = rays->square[OPPOSITE_GIVEN];
+	rays->aside = 0;
+	for (int i = -ASIDE_STEPS; i <= ASIDE_STEPS; i++) {
+		const struct comparison at = compare(reduced, matrices, i * ASIDE_STEP);
+
+		if (2 * at.pairs <= rays->pairs[OPPOSITE_GIVEN] || at.difference >= rays->least)
+			continue;
+		rays->least = at.difference;
+		rays->aside = i * ASIDE_STEP;
+	}
+}
+
+int opposite_rays_compare(const struct reduced *reduced, const double axis[3], struct opposite_rays *ret_rays,
+			  struct error *err)
+{
+	const struct geometry *geometry = &reduced->geometry;
+	double(*matrices)[12] = malloc((size_t)geometry->count * sizeof(*matrices));
+
+	if (matrices == NULL)
+		return error_set(err, ERR_NO_MEMORY, "no memory for the matrices of %d views", geometry->count);
+	for (int which = 0; which < OPPOSITE_CASES; which++) {
+		struct comparison found;
+
+		for (int k = 0; k < geometry->count; k++) {
+			const struct view view =
+			    view_of_case(&geometry->views[k], geometry->columns, axis, (enum opposite_case)which);
+
+			view_matrix(&view, matrices[k]);
+		}
+		found = compare(reduced, matrices, 0);
+		ret_rays->pairs[which] = found.pairs;
+		ret_rays->square[which] = found.difference;
+		if (which != OPPOSITE_GIVEN)
+			continue;
+		ret_rays->noticed = found.difference > pow(SHARE_LEAST, 2) * found.integral;
+		compare_aside(reduced, matrices, ret_rays);
+	}
+	free(matrices);
+	return 0;
+}
+
+/* True if the case is possible, and explains so many times more than the other one. */
+static bool is_better(const struct opposite_rays *rays, enum opposite_case which, enum opposite_case than, double times)
+{
+	return rays->noticed && 2 * rays->pairs[which] > rays->pairs[OPPOSITE_GIVEN] && rays->pairs[than] > 0 &&
+	       times * rays->square[which] < rays->square[than];
+}
+
+bool opposite_rays_other_way(const struct opposite_rays *rays)
+{
+	for (int i = OPPOSITE_OTHER_WAY; i <= OPPOSITE_MIRRORED; i++)
+		if (is_better(rays, i, OPPOSITE_GIVEN, SMALLER) && NEARLY * rays->square[i] < rays->least &&
+		    (rays->pairs[OPPOSITE_OTHER_SIDE] == 0 || is_better(rays, i, OPPOSITE_OTHER_SIDE, NEARLY)))
+			return true;
+	return false;
+}
+
+bool opposite_rays_displaced(const struct opposite_rays *rays)
+{
+	return is_better(rays, OPPOSITE_OTHER_SIDE, OPPOSITE_GIVEN, FAR_SMALLER);
+}
+
+bool opposite_rays_aside(const struct opposite_rays *rays)
+{
+	return rays->noticed && fabs(rays->aside) >= FAR_ASIDE &&
+	       FAR_SMALLER * rays->least < rays->square[OPPOSITE_GIVEN];
+}

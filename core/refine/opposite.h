@@ -1,0 +1,43 @@
+#ifndef CBCT_CORE_OPPOSITE_H
+#define CBCT_CORE_OPPOSITE_H
+
+#include "core/refine/reduced.h"
+
+/*
+ * Rays that two views have in common: the line through both sources is a ray of either, where both detectors catch it,
+ * and its integral is the same from both ends. Whatever the object is, wider than the detector or not, both views show
+ * the same there if sources and detectors stood as the geometry says. Only the rows about the orbit's plane have such
+ * rays, and of a short scan only the views near its ends have.
+ *
+ * The mean square of the differences is taken for the geometry as it is, and for others that a scan's description is
+ * mistaken for.
+ */
+enum opposite_case {
+	OPPOSITE_GIVEN,
+	OPPOSITE_OTHER_WAY,  /* the arm turned the other way: each detector is mirrored at the plane of source and axis
+			      */
+	OPPOSITE_MIRRORED,   /* the columns of the projections are mirrored */
+	OPPOSITE_OTHER_SIDE, /* the detector is displaced to the other side: both of these */
+	OPPOSITE_CASES
+};
+
+struct opposite_rays {
+	int pairs[OPPOSITE_CASES]; /* 0 where there are too few to say anything */
+	double square[OPPOSITE_CASES];
+	bool noticed; /* the differences for the given geometry are large enough that another one may be looked for */
+	/* The least for detectors that all stand aside of the given geometry by the same, and bins by which they do. */
+	double least, aside;
+};
+
+/* axis: the orbit's, a unit vector. ERR_NO_MEMORY is the only error. The same bits for any number of threads. */
+int opposite_rays_compare(const struct reduced *reduced, const double axis[3], struct opposite_rays *ret_rays,
+			  struct error *err);
+
+/* True if the other way round, or mirrored columns, explain what the given geometry does not, and nothing else does. */
+bool opposite_rays_other_way(const struct opposite_rays *rays);
+/* True if a detector that is displaced to the other side explains what the given geometry does not. */
+bool opposite_rays_displaced(const struct opposite_rays *rays);
+/* True if detectors that stand far aside, all by the same, explain what the given geometry does not. */
+bool opposite_rays_aside(const struct opposite_rays *rays);
+
+#endif
