@@ -81,6 +81,9 @@ const struct warning_kind warning_kinds[] = {
      "be wrong there."},
     {"scatter_exceeds", SEVERITY_SERIOUS,
      "The scattered radiation given for this scan is more than was measured in many places: the image may be wrong."},
+    {"scatter_uneven", SEVERITY_CAUTION,
+     "Images of scattered radiation from nearly the same direction differ too much: one of them is wrong, and gray "
+     "values may be off."},
     {"scatter_spikes", SEVERITY_CAUTION,
      "Single pixels of the images of scattered radiation were wrong and were replaced from their neighbours."},
     {"air_saturated", SEVERITY_SERIOUS, "The value given for air is one at which the detector is saturated."},

@@ -25,6 +25,7 @@ struct scatter_stack {
 		float *image;
 	} read[2];
 	size_t *spikes; /* [source->count] */
+	double *levels; /* likewise: the mean of each, below 0 before it was read */
 	float *image;   /* of the projection */
 };
 
@@ -89,16 +90,19 @@ int scatter_stack_new(const struct scatter_images *images, const struct scatter_
 	stack->source = source;
 	stack->image = malloc(scatter_image_bytes(images));
 	stack->spikes = calloc((size_t)source->count, sizeof(*stack->spikes));
+	stack->levels = malloc((size_t)source->count * sizeof(*stack->levels));
 	for (int i = 0; i < 2; i++) {
 		stack->count[i] = blocks->count[i];
 		stack->read[i].at = -1;
 		stack->read[i].image = malloc(scatter_image_bytes(images));
 		lacks |= place_pixels(stack, i, blocks, detector[i], most[i]) != 0 || stack->read[i].image == NULL;
 	}
-	if (lacks || stack->image == NULL || stack->spikes == NULL) {
+	if (lacks || stack->image == NULL || stack->spikes == NULL || stack->levels == NULL) {
 		scatter_stack_free(stack);
 		return error_set(err, ERR_NO_MEMORY, "no memory for images of %zu bytes", scatter_image_bytes(images));
 	}
+	for (int i = 0; i < source->count; i++)
+		stack->levels[i] = -1;
 	*ret_stack = stack;
 	return 0;
 }
@@ -114,7 +118,18 @@ void scatter_stack_free(struct scatter_stack *stack)
 	}
 	free(stack->image);
 	free(stack->spikes);
+	free(stack->levels);
 	free(stack);
+}
+
+static double mean_of(const struct scatter_images *images, const float *image)
+{
+	const int pixels = images->columns * images->rows;
+	double sum = 0;
+
+	for (int i = 0; i < pixels; i++)
+		sum += (double)image[i];
+	return sum / pixels;
 }
 
 /* The image of the source's, which takes the place of one that is not `other`. */
@@ -129,6 +144,8 @@ static int read_image(struct scatter_stack *stack, int at, int other, const floa
 		if (code == 0)
 			code = scatter_spikes_replace(stack->read[slot].image, stack->images.columns,
 						      stack->images.rows, &stack->spikes[at], err);
+		if (code == 0)
+			stack->levels[at] = mean_of(&stack->images, stack->read[slot].image);
 	}
 	if (code == 0) {
 		stack->read[slot].at = at;
@@ -197,4 +214,9 @@ size_t scatter_stack_spikes(const struct scatter_stack *stack, int *ret_images, 
 			*ret_first = stack->source->projections[at];
 	}
 	return spikes;
+}
+
+double scatter_stack_level(const struct scatter_stack *stack, int at)
+{
+	return stack->levels[at];
 }

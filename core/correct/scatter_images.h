@@ -37,4 +37,7 @@ void scatter_stack_row(const struct scatter_stack *stack, int row, float *ret_ro
  * number. */
 size_t scatter_stack_spikes(const struct scatter_stack *stack, int *ret_images, int *ret_first);
 
+/* The mean of the source's image `at`, counts, as it was turned to; below 0: it was not. */
+double scatter_stack_level(const struct scatter_stack *stack, int at);
+
 #endif

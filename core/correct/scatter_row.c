@@ -10,12 +10,20 @@
 #include "core/correct/input.h"
 #include "core/correct/scatter.h"
 #include "core/correct/scatter_images.h"
+#include "core/select.h"
 
 /* At least this share of a count is left: no model is so good that it could take more. */
 static const float KEPT_LEAST = 0.05f;
 /* Samples that are held at that share, from which on it is told, of an estimate and of images; and that the image may
  * be wrong as a whole. */
 static const double LIMITED_MANY = 0.01, LIMITED_OF_IMAGES = 0.001, EXCEEDED = 0.03;
+/* Scatter changes little within so many radians: an image that has as many times what the one beside it has is wrong.
+ */
+static const double NEAR = 0.36, UNEVEN = 3;
+/* So it is further apart, where there are as many images and it changes by as many times what is usual. */
+enum { MANY_IMAGES = 8 };
+static const float UNUSUAL = 5;
+static const double PI = 3.14159265358979323846;
 /* Of the counts: images with less than that are in another unit than the projections. */
 static const double FAINT = 0.001;
 
@@ -254,12 +262,84 @@ static void warn_of_spikes(const struct correction_job *job, const struct scatte
 			     spikes, count, first);
 }
 
+/* The gantry's angle at a projection that has an image; NaN where the reconstruction does not have it. */
+static double angle_at(const struct correction_job *job, int projection)
+{
+	const int *numbers = job->input->given.numbers;
+
+	for (int view = 0; view < job->orbit->count; view++)
+		if ((numbers != NULL ? numbers[view] : view) == projection)
+			return job->orbit->angle[view];
+	return NAN;
+}
+
+static bool are_near(const struct correction_job *job, int one, int other)
+{
+	const double apart = fabs(angle_at(job, one) - angle_at(job, other));
+
+	return fmin(apart, 2 * PI - apart) < NEAR;
+}
+
+/* By how many times, of the logarithm, each image is more or less than that before it: ret[count - 1], 0 where one was
+ * not read. Returns half of them from above. */
+static float find_jumps(const struct scatter_stack *images, int count, float *ret, float *scratch)
+{
+	for (int at = 1; at < count; at++) {
+		const double one = scatter_stack_level(images, at - 1), other = scatter_stack_level(images, at);
+		const bool known = one >= 0 && other >= 0 && one != other;
+
+		scratch[at - 1] = ret[at - 1] = known ? (float)fabs(log(one) - log(other)) : 0;
+	}
+	return select_kth(scratch, count - 1, (count - 1) / 2);
+}
+
+static void tell_uneven(const struct correction_job *job, const struct scatter_stack *images, int count, int at)
+{
+	const int *projections = job->input->given.scatter_source->projections;
+
+	warning_tell(
+	    job->warnings, "scatter_uneven",
+	    "from one image of scatter to the next it changes by more than %g times at %d places, first from "
+	    "%.3g counts on average of projection %d to %.3g of projection %d: is one of them in another unit, "
+	    "or empty?",
+	    UNEVEN, count, scatter_stack_level(images, at - 1), projections[at - 1], scatter_stack_level(images, at),
+	    projections[at]);
+}
+
+/*
+ * Where one image is several times the one before it, one of them is wrong: they are near each other, or the others
+ * change far less, or it is of nothing at all.
+ */
+static int warn_of_uneven(const struct correction_job *job, const struct scatter_stack *images, struct error *err)
+{
+	const struct scatter_source *source = job->input->given.scatter_source;
+	float *jumps = malloc(2 * (size_t)source->count * sizeof(*jumps)), usual;
+	int count = 0, first = 0;
+
+	if (jumps == NULL)
+		return error_set(err, ERR_NO_MEMORY, "no memory for %d images", source->count);
+	usual = source->count > 1 ? find_jumps(images, source->count, jumps, jumps + source->count) : 0;
+	for (int at = source->count - 1; at > 0; at--) {
+		const float jump = jumps[at - 1];
+
+		if ((double)jump > log(UNEVEN) &&
+		    (isinf(jump) || are_near(job, source->projections[at - 1], source->projections[at]) ||
+		     (source->count >= MANY_IMAGES && jump > UNUSUAL * usual))) {
+			count++;
+			first = at;
+		}
+	}
+	free(jumps);
+	if (count > 0)
+		tell_uneven(job, images, count, first);
+	return 0;
+}
+
 static int warn(const struct correction_job *job, void *context, struct error *err)
 {
 	const struct state *state = context;
 	const struct scatter_model *model = job->input->given.scatter;
 
-	(void)err;
 	if (state->views == 0)
 		return 0;
 	if (model->fraction > 0)
@@ -274,9 +354,10 @@ static int warn(const struct correction_job *job, void *context, struct error *e
 		    "the projections' counts above the dark?",
 		    100 * state->shares / state->views);
 	warn_of_limits(job, state);
-	if (state->images != NULL)
-		warn_of_spikes(job, state->images);
-	return 0;
+	if (state->images == NULL)
+		return 0;
+	warn_of_spikes(job, state->images);
+	return warn_of_uneven(job, state->images, err);
 }
 
 extern const struct correction correction_scatter;

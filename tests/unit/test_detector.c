@@ -774,11 +774,14 @@ START_TEST(images_of_scatter_without_spikes_stay)
 }
 END_TEST
 
-/* Images that want nearly all of the signal, and images in a unit that no count has: told. */
+/* Images that want nearly all of the signal, or in a unit that no count has; one that is empty amid others, and one in
+ * another unit than that 19 degrees before it, or 38 degrees before and behind it: told. */
 START_TEST(images_of_scatter_that_cannot_be_are_told)
 {
 	const struct recipe recipe = fdk_on(20, 8, 10);
-	const float factors[] = {3e-5F, 40};
+	const float factors[] = {3e-5F, 40, 0, 4, 0.25F};
+	const char *const told[] = {
+	    "scatter_faint: ", "scatter_exceeds: ", "scatter_uneven: ", "scatter_uneven: ", "scatter_uneven: "};
 	float cells[ANGLES * ACROSS * ALONG], *counts;
 	struct outcome with = {0};
 	struct given_images given;
@@ -791,11 +794,13 @@ START_TEST(images_of_scatter_that_cannot_be_are_told)
 	counts = counts_with_scatter(&scene, cells, 1);
 	make_images(&scene, counts, &given);
 	for (size_t i = 0; i < given.each * (size_t)given.source.count; i++)
-		given.pixels[i] *= factors[_i];
+		if (_i < 2 || (int)(i / given.each) == (_i == 3 ? given.source.count - 1 : 3))
+			given.pixels[i] *= factors[_i];
 	with.samples = counts;
 	with.linearise = with_images(&given);
 	run(&scene, &recipe, &with);
-	ck_assert_ptr_nonnull(strstr(with.warnings, _i == 0 ? "scatter_faint: " : "scatter_exceeds: "));
+	ck_assert_msg(strstr(with.warnings, told[_i]) != NULL, "%s is not told: %s", told[_i], with.warnings);
+	ck_assert_int_eq(strstr(with.warnings, "scatter_uneven: ") != NULL, _i >= 2);
 	outcome_clear(&with);
 	scene_clear(&scene);
 	free(given.pixels);
@@ -982,7 +987,7 @@ Suite *detector_suite(void)
 	tcase_add_loop_test(images, a_block_has_the_mean_scatter_of_its_pixels, 0, 2);
 	tcase_add_loop_test(images, spikes_in_images_of_scatter_are_replaced, 0, 2);
 	tcase_add_loop_test(images, images_of_scatter_without_spikes_stay, 0, 7);
-	tcase_add_loop_test(images, images_of_scatter_that_cannot_be_are_told, 0, 2);
+	tcase_add_loop_test(images, images_of_scatter_that_cannot_be_are_told, 0, 5);
 	suite_add_tcase(suite, images);
 	tcase_add_test(fits, hardening_is_fitted_from_steps_of_water);
 	suite_add_tcase(suite, fits);

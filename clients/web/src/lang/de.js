@@ -508,6 +508,7 @@ export const strings = {
 	'Images of scattered radiation that the scan announces are not there yet: it waits for them.': 'Bilder der Streustrahlung, die der Scan ankündigt, sind noch nicht da: Er wartet darauf.',
 	'The correction for scattered radiation wanted to take nearly all of the signal in some places: gray values may be wrong there.': 'Die Streukorrektur wollte an einigen Stellen fast das ganze Signal abziehen: Grauwerte können dort falsch sein.',
 	'The scattered radiation given for this scan is more than was measured in many places: the image may be wrong.': 'Die angegebene Streustrahlung ist an vielen Stellen mehr, als gemessen wurde: Das Bild kann falsch sein.',
+	'Images of scattered radiation from nearly the same direction differ too much: one of them is wrong, and gray values may be off.': 'Bilder der Streustrahlung aus fast derselben Richtung unterscheiden sich zu sehr: Eines davon ist falsch, und Grauwerte können abweichen.',
 	'Single pixels of the images of scattered radiation were wrong and were replaced from their neighbours.': 'Einzelne Pixel der Bilder der Streustrahlung waren falsch und wurden aus ihren Nachbarn ersetzt.',
 	'The value given for air is one at which the detector is saturated.': 'Beim angegebenen Wert für Luft ist der Detektor gesättigt.',
 	'The scan was broken off: the image is made of the projections that arrived.': 'Der Scan wurde abgebrochen: Das Bild ist aus den angekommenen Projektionen.',
