@@ -34,62 +34,71 @@ static __global__ void __launch_bounds__(COLUMNS_THREADS, 3) backproject_tilted(
 			matched_put(job, ((size_t)(z + n) * size[1] + y) * size[0] + x, sums[n * COLUMNS_THREADS]);
 }
 
-/*
- * Puts the sums of a tile's thread, those of the columns beside the grid with the outer ones. `shared`: of RUN rows of
- * PENCILS_WIDE.
- */
-template <int AXIS, int RUN>
-static __device__ __forceinline__ void put_runs(const matched_job &job, const matched_run &run, int wide, float *shared,
-						float sum[RUN])
+/* Adds the sums of columns beside the grid to those of the outer ones. */
+template <int AXIS>
+static __device__ __forceinline__ void add_beside(const matched_job &job, const matched_run &run, int wide,
+						  leaning_tile &tile, float sum[LEANING_RUN])
 {
-	float(*sums)[PENCILS_WIDE] = (float(*)[PENCILS_WIDE])shared;
-	const int *size = job.grid.size;
-	const int j = (int)threadIdx.x, fast = run.fast + j, most = size[1 - AXIS];
-	const int x = AXIS == ACROSS_X ? run.slice : fast, y = AXIS == ACROSS_X ? fast : run.slice;
+	float(*sums)[LEANING_WIDE] = (float(*)[LEANING_WIDE])tile.profile[0];
+	const int j = (int)threadIdx.x, fast = run.fast + j, last = job.grid.size[1 - AXIS] - 1;
 
 #pragma unroll
-	for (int k = 0; k < RUN; k++)
+	for (int k = 0; k < LEANING_RUN; k++)
 		sums[k][j] = sum[k];
 	__syncthreads();
-	if (j >= wide || fast < 0 || fast >= most)
+	if (j >= wide || (fast != 0 && fast != last))
 		return;
 #pragma unroll
-	for (int k = 0; k < RUN; k++) {
-		for (int i = 1; i <= PENCILS_BEYOND; i++) {
+	for (int k = 0; k < LEANING_RUN; k++)
+		for (int i = 1; i <= LEANING_BEYOND; i++) {
 			sum[k] += fast == 0 ? sums[k][j - i] : 0.0f;
-			sum[k] += fast == most - 1 ? sums[k][j + i] : 0.0f;
+			sum[k] += fast == last ? sums[k][j + i] : 0.0f;
 		}
-		if (run.row + k < size[2])
-			matched_put(job, ((size_t)(run.row + k) * size[1] + y) * size[0] + x, sum[k]);
-	}
 }
 
-/* What rays of one axis give, in tiles that have `wide` columns each, those beside the grid among them. */
+/* Puts the sums of a tile's thread, but those beside the grid. */
+template <int AXIS, int RUN>
+static __device__ __forceinline__ void put_runs(const matched_job &job, const matched_run &run, int wide,
+						const float sum[RUN])
+{
+	const int *size = job.grid.size;
+	const int j = (int)threadIdx.x, fast = run.fast + j;
+	const int x = AXIS == ACROSS_X ? run.slice : fast, y = AXIS == ACROSS_X ? fast : run.slice;
+
+	if (j >= wide || fast < 0 || fast >= size[1 - AXIS])
+		return;
+#pragma unroll
+	for (int k = 0; k < RUN; k++)
+		if (run.row + k < size[2])
+			matched_put(job, ((size_t)(run.row + k) * size[1] + y) * size[0] + x, sum[k]);
+}
+
+/* What rays of one axis give, in tiles of `wide` columns, those beside the grid among them. */
 template <int AXIS>
-static __global__ void __launch_bounds__(PENCILS_WIDE, PENCILS_BLOCKS)
+static __global__ void __launch_bounds__(LEANING_WIDE, LEANING_BLOCKS)
     backproject_leaning(const matched_job job, int wide)
 {
 	__shared__ leaning_tile tile;
-	const matched_run run = {AXIS, (int)blockIdx.x, (int)blockIdx.y * wide - PENCILS_BEYOND,
+	const matched_run run = {AXIS, (int)blockIdx.x, (int)blockIdx.y * wide - LEANING_BEYOND,
 				 (int)blockIdx.z * LEANING_RUN};
 	float sum[LEANING_RUN] = {};
 
 	leaning_thread<AXIS>(job, run, wide, tile, sum);
-	put_runs<AXIS, LEANING_RUN>(job, run, wide, tile.profile[0], sum);
+	add_beside<AXIS>(job, run, wide, tile, sum);
+	put_runs<AXIS, LEANING_RUN>(job, run, wide, sum);
 }
 
-/* The same upright. */
+/* The same upright, in tiles of the grid's columns. */
 template <int AXIS>
-static __global__ void __launch_bounds__(PENCILS_WIDE, PENCILS_BLOCKS)
+static __global__ void __launch_bounds__(UPRIGHT_WIDE, UPRIGHT_BLOCKS)
     backproject_upright(const matched_job job, int wide)
 {
 	__shared__ upright_tile tile;
-	const matched_run run = {AXIS, (int)blockIdx.x, (int)blockIdx.y * wide - PENCILS_BEYOND,
-				 (int)blockIdx.z * UPRIGHT_RUN};
+	const matched_run run = {AXIS, (int)blockIdx.x, (int)blockIdx.y * wide, (int)blockIdx.z * UPRIGHT_RUN};
 	float sum[UPRIGHT_RUN] = {};
 
 	upright_thread<AXIS>(job, run, wide, tile, sum);
-	put_runs<AXIS, UPRIGHT_RUN>(job, run, wide, &tile.profile[0][0].x, sum);
+	put_runs<AXIS, UPRIGHT_RUN>(job, run, wide, sum);
 }
 
 /*
@@ -150,19 +159,19 @@ template <int AXIS>
 static int launch_axis(const matched_job &job, bool upright, cudaStream_t stream, struct error *err)
 {
 	const int *size = job.grid.size;
-	const int columns = size[1 - AXIS] + 2 * PENCILS_BEYOND, run = upright ? (int)UPRIGHT_RUN : (int)LEANING_RUN;
-	int tiles = divide_up(columns, PENCILS_WIDE);
+	const int beyond = upright ? 0 : (int)LEANING_BEYOND, columns = size[1 - AXIS] + 2 * beyond;
+	int tiles = divide_up(columns, upright ? (int)UPRIGHT_WIDE : (int)LEANING_WIDE);
 
 	/* The last one has an outer column of the grid and those beyond it. */
-	while (columns - (tiles - 1) * divide_up(columns, tiles) < 1 + PENCILS_BEYOND)
+	while (columns - (tiles - 1) * divide_up(columns, tiles) < 1 + beyond)
 		tiles++;
-	const dim3 blocks(size[AXIS], tiles, divide_up(size[2], run));
 	const int wide = divide_up(columns, tiles);
+	const dim3 blocks(size[AXIS], tiles, divide_up(size[2], upright ? (int)UPRIGHT_RUN : (int)LEANING_RUN));
 
 	if (upright)
-		backproject_upright<AXIS><<<blocks, PENCILS_WIDE, 0, stream>>>(job, wide);
+		backproject_upright<AXIS><<<blocks, UPRIGHT_WIDE, 0, stream>>>(job, wide);
 	else
-		backproject_leaning<AXIS><<<blocks, PENCILS_WIDE, 0, stream>>>(job, wide);
+		backproject_leaning<AXIS><<<blocks, LEANING_WIDE, 0, stream>>>(job, wide);
 	LAUNCHED();
 	return 0;
 }

@@ -6,24 +6,26 @@
  * that a pencil (matched_columns.cuh) crosses a slice along a line that goes aside by less than a voxel in a run's
  * height.
  *
- * A block has one slice of one axis, PENCILS_WIDE runs side by side. A thread walks the rays of a pencil and makes its
- * profile, what it has for each row of voxels; then each run takes what the pencils beside it have for it. Each ray's
- * weights are found once. It counts for the two rows that it passes between, of which two sums go along. Upright, a
- * pencil has one place across the slice, one profile and weights for four columns. Where it leans it has a profile for
- * each of five columns.
+ * A block has one slice of one axis, up to as many runs side by side as it has threads. A thread walks the rays of a
+ * pencil and makes its profile, what it has for each row of voxels; then each run takes what the pencils beside it have
+ * for it. Each ray's weights are found once. It counts for the two rows that it passes between, of which two sums go
+ * along. Upright, a pencil has one place across the slice, one profile and weights for four columns. Where it leans it
+ * has a profile for each of five columns.
  *
- * Pencils of all views stand in one row, PENCILS_WIDE of them at a time, so that every thread has one. What is
+ * Pencils of all views stand in one row, and are taken up as many at a time as there are threads. What is
  * projected comes times the step from slice to slice along the ray (matched.cu).
  *
- * What falls beyond the outer voxels along the fast axis goes to PENCILS_BEYOND columns beside the grid, which are
- * added to the outer ones at last: there rays have no other weights than inside.
+ * What falls beyond the outer voxels along the fast axis these have too, since rays have the same weights beside the
+ * grid as inside: upright by the pencil's weights, leaning by LEANING_BEYOND columns beside the grid, which are added
+ * to the outer ones at last.
  */
 #include "kernels/matched_columns.cuh"
 
-enum { PENCILS_WIDE = 128 };  /* runs of a block at most, and its threads */
-enum { PENCILS_BLOCKS = 5 };  /* on a multiprocessor at a time */
-enum { PENCILS_BEYOND = 2 };  /* columns on either side of the grid */
+enum { PENCILS_MOST = 128 };  /* in hand at a time */
 enum { PENCILS_VIEWS = 32 };  /* whose pencils are found at a time, by a warp */
+enum { LEANING_WIDE = 128 };  /* runs of a block at most, and its threads */
+enum { LEANING_BEYOND = 2 };  /* columns on either side of the grid */
+enum { LEANING_BLOCKS = 5 };  /* on a multiprocessor at a time */
 enum { LEANING_COLUMNS = 5 }; /* that a pencil gives to */
 enum { LEANING_AHEAD = 2 };   /* rays of a pencil that are loaded before the ones in hand are used */
 
@@ -43,11 +45,11 @@ struct pencils_view {
 struct pencil_row {
 	pencils_view views[PENCILS_VIEWS];
 	int start[PENCILS_VIEWS + 1];
-	short left[PENCILS_WIDE]; /* the first column that each gives to, counted from the tile's */
+	short left[PENCILS_MOST]; /* the first column that each gives to, counted from the tile's */
 };
 
 struct leaning_tile {
-	float profile[PENCILS_WIDE][LEANING_RUN * LEANING_COLUMNS + 1]; /* an odd distance from pencil to pencil */
+	float profile[LEANING_WIDE][LEANING_RUN * LEANING_COLUMNS + 1]; /* an odd distance from pencil to pencil */
 	pencil_row row;
 };
 
@@ -60,10 +62,17 @@ struct leaning_pencil {
 	float r, sign;
 	const float *row;
 	ptrdiff_t step;
-	int j;         /* the second column, in the grid */
+	float centred; /* the second column, from the middle of the grid */
 	bool diagonal; /* some rays may be of the other axis */
-	bool closely;  /* or cross a part of the slice */
+	bool beside;   /* some may cross a part of the slice */
+	bool closely;  /* some are diagonal, or some row of voxels has no ray just above it */
 };
+
+/*
+ * What is asked of a pencil's rays: nothing, since they cross all of the slice; what part of it, between the grid's
+ * sides or between its ends; or all that may be, their axis and rows of voxels that none is just above among it.
+ */
+enum pencil_care { CARE_NONE, CARE_SIDES, CARE_ENDS, CARE_ALL };
 
 /* How far beyond a voxel pencils lie that give to it, for a tile `wide` runs wide; below 0: none come near. */
 static __device__ __forceinline__ float pencils_reach(const device_view &g, const slice_axes &axes,
@@ -101,11 +110,17 @@ static __device__ __forceinline__ pencil_range pencils_range(const matched_job &
 	return {(int)ceilf(fmaxf(least - margin, 0.0f)), (int)floorf(fminf(most + margin, (float)(job.columns - 1)))};
 }
 
+/* As row_at, to what its margin needs. */
+static __device__ __forceinline__ float pencils_row(const pencil &p, float up)
+{
+	return fmaf(up, p.along.value, -p.up.value) * reciprocal(fmaf(-up, p.along.change, p.up.change));
+}
+
 /* Where a pencil crosses the slice at the middle of the run's height. */
 template <int RUN>
 static __device__ __forceinline__ float pencils_place(const pencil &p)
 {
-	float r = row_at(p, 0.5f * (float)(RUN - 1));
+	float r = pencils_row(p, 0.5f * (float)(RUN - 1));
 
 	return at_row(p.across, r) / at_row(p.along, r);
 }
@@ -134,7 +149,7 @@ static __device__ __forceinline__ void pencils_find(const matched_job &job, int 
 			float a = pencils_place<RUN>(pencil_of(f, (float)range.first - half));
 			float b = pencils_place<RUN>(pencil_of(f, (float)range.last - half));
 			float middle = 0.5f * (float)(range.first + range.last) - half;
-			float r = row_at(pencil_of(f, middle), 0.0f),
+			float r = pencils_row(pencil_of(f, middle), 0.0f),
 			      sign = form(f.along, middle, r) < 0 ? -1.0f : 1.0f;
 
 			for (int i = 0; i < 3; i++) {
@@ -162,15 +177,11 @@ static __device__ __forceinline__ void pencils_find(const matched_job &job, int 
 	row.start[lane + 1] = end;
 }
 
-/* The view that a pencil of the row is of. */
-static __device__ __forceinline__ int pencils_view_of(const pencil_row &row, int item)
+/* The view that a pencil of the row is of, which is `view` or a later one. */
+static __device__ __forceinline__ int pencils_view_of(const pencil_row &row, int item, int view)
 {
-	int view = 0;
-
-#pragma unroll
-	for (int step = PENCILS_VIEWS / 2; step > 0; step /= 2)
-		if (row.start[view + step] <= item)
-			view += step;
+	while (row.start[view + 1] <= item)
+		view++;
 	return view;
 }
 
@@ -183,19 +194,30 @@ static __device__ __forceinline__ bool pencils_is_of_axis(const pencil &p, float
 	return AXIS == ACROSS_X ? along >= other : along > other;
 }
 
-/* Sets out on the pencil `item` of the row. */
+/*
+ * Whether a pencil's rays, of which that to `low` is a voxel below the run and that to `high` as much above it, pass
+ * just above each row of voxels: none of these is left out, and what each has is complete when the next ray comes.
+ */
+static __device__ __forceinline__ bool is_seamless(float low, float high, float half, int run)
+{
+	const float margin = 1e-3f;
+
+	return fminf(low, high) - margin >= -half && fmaxf(low, high) + margin <= half &&
+	       0.99f * fabsf(high - low) >= (float)(run + 1);
+}
+
+/* Sets out on the pencil `item` of the row, of its view v. */
 template <int AXIS>
 static __device__ __forceinline__ void leaning_begin(const matched_job &job, const matched_run &run,
-						     const slice_axes &axes, int first_view, int item, int wide,
+						     const slice_axes &axes, int first_view, int v, int item, int wide,
 						     leaning_tile &tile, leaning_pencil &p)
 {
-	const int v = pencils_view_of(tile.row, item);
 	const pencils_view &view = tile.row.views[v];
 	const int column = view.first + view.step * (item - tile.row.start[v]);
 	const float half = 0.5f * (float)(job.rows - 1), margin = 1e-3f;
 
 	p.rays = pencil_of(view.forms, (float)column - 0.5f * (float)(job.columns - 1));
-	float low = row_at(p.rays, -1.0f), high = row_at(p.rays, (float)LEANING_RUN);
+	float low = pencils_row(p.rays, -1.0f), high = pencils_row(p.rays, (float)LEANING_RUN);
 	const bool upwards = high > low;
 	int first = (int)ceilf(fmaxf(fminf(low, high) - margin, -half) + half);
 	int last = (int)floorf(fminf(fmaxf(low, high) + margin, half) + half);
@@ -210,12 +232,16 @@ static __device__ __forceinline__ void leaning_begin(const matched_job &job, con
 	float from = floorf(fminf(a, b));
 	bool of[2] = {pencils_is_of_axis<AXIS>(p.rays, p.r), pencils_is_of_axis<AXIS>(p.rays, end)};
 
-	/* Too far aside for this tile, or all of the other axis. */
-	if (from + 3 < 0 || from - 1 > (float)(wide - 1) || (!of[0] && !of[1]))
+	if (!of[0] && !of[1])
 		p.count = 0;
-	p.j = run.fast + (int)from;
+	p.centred = (float)run.fast + from - 0.5f * (float)(axes.fast - 1);
 	p.diagonal = !(of[0] && of[1]);
-	p.closely = p.diagonal || p.j <= 0 || p.j + 1 >= axes.fast - 2;
+	p.beside = run.fast + from < 1 || run.fast + from > (float)(axes.fast - 4);
+	p.closely = p.diagonal || !is_seamless(low, high, half, LEANING_RUN);
+	if (from + 3 < 0 || from - 1 > (float)(wide - 1)) { /* too far aside for this tile */
+		p.count = 0;
+		p.closely = p.beside = false;
+	}
 	p.rays.across.value = fmaf(-from, p.rays.along.value, p.rays.across.value);
 	p.rays.across.change = fmaf(-from, p.rays.along.change, p.rays.across.change);
 	p.row =
@@ -223,22 +249,18 @@ static __device__ __forceinline__ void leaning_begin(const matched_job &job, con
 	tile.row.left[threadIdx.x] = (short)fminf(fmaxf(from - 1, -30000.0f), 30000.0f);
 }
 
-/* B of matched.cuh for the five columns, of a ray at y from the second of them. */
-static __device__ __forceinline__ void leaning_weights(float y, float slope, float weight[LEANING_COLUMNS])
+/* B of matched.cuh for four columns, of a ray `right` of the second of them. */
+struct four_weights {
+	float of[4];
+};
+static __device__ __forceinline__ four_weights weights_of(float right, float slope, float inverse)
 {
 	/* Without a slope there are products of 0 and infinity, which saturate to 0. */
-	const float inverse = reciprocal(slope), sixth = slope * (1.0f / 6.0f);
-	const bool beyond = y >= 1.0f;
-	float right = beyond ? y - 1.0f : y, left = 1.0f - right;
+	const float sixth = slope * (1.0f / 6.0f), left = 1.0f - right;
 	float a = __saturatef(fmaf(-right, inverse, 1.0f)), b = __saturatef(fmaf(-left, inverse, 1.0f));
 	float k0 = sixth * a * (a * a), k1 = sixth * b * (b * b);
-	float w1 = fmaf(-2.0f, k0, k1) + left, w2 = fmaf(-2.0f, k1, k0) + right;
 
-	weight[0] = beyond ? 0.0f : k0;
-	weight[1] = beyond ? k0 : w1;
-	weight[2] = beyond ? w1 : w2;
-	weight[3] = beyond ? w2 : k1;
-	weight[4] = beyond ? k1 : 0.0f;
+	return {k0, fmaf(-2.0f, k0, k1) + left, fmaf(-2.0f, k1, k0) + right, k1};
 }
 
 /* Narrows [from, to] as clip does, to what a correction of float needs. */
@@ -250,7 +272,16 @@ static __device__ __forceinline__ void pencils_clip(float at, float slope, float
 	to = fminf(to, fmaxf(a, b));
 }
 
-/* The part of the slice that a ray crosses, as beside sides, ends and diagonal; changes up to what it counts as. */
+/*
+ * The part of the slice that a ray crosses between two sides of the grid, or its ends, of its place from the middle and
+ * the inverse of its slope: at most one of them cuts it, since it goes aside by less than a voxel.
+ */
+static __device__ __forceinline__ float part_between(float at, float inverse, int size)
+{
+	return __saturatef(fmaf(0.5f * (float)size - fabsf(at), inverse, 0.5f));
+}
+
+/* The same between all four, and of the slice's axis; changes up to what it counts as. */
 template <int AXIS>
 static __device__ __forceinline__ float leaning_part(const leaning_pencil &p, const matched_run &run,
 						     const slice_axes &axes, float r, float inverse, float y,
@@ -258,11 +289,21 @@ static __device__ __forceinline__ float leaning_part(const leaning_pencil &p, co
 {
 	float from = -0.5f, to = 0.5f;
 
-	pencils_clip(y + (float)p.j - 0.5f * (float)(axes.fast - 1), slope, 0.5f * (float)axes.fast, from, to);
+	pencils_clip(y + p.centred, slope, 0.5f * (float)axes.fast, from, to);
 	pencils_clip(up + (float)run.row - 0.5f * (float)(axes.rows - 1), at_row(p.rays.rise, r) * inverse,
 		     0.5f * (float)axes.rows, from, to);
 	up = fminf(fmaxf(up, (float)-run.row), (float)(axes.rows - 1 - run.row));
 	return p.diagonal && !pencils_is_of_axis<AXIS>(p.rays, r) ? 0.0f : fmaxf(to - from, 0.0f);
+}
+
+/* The part that lies between the ends; changes up to what it counts as. */
+static __device__ __forceinline__ float part_at_ends(const matched_run &run, const slice_axes &axes, float rise,
+						     float &up)
+{
+	float at = up + ((float)run.row - 0.5f * (float)(axes.rows - 1));
+
+	up = fminf(fmaxf(up, (float)-run.row), (float)(axes.rows - 1 - run.row));
+	return part_between(at, reciprocal(fabsf(rise)), axes.rows);
 }
 
 /* The two rows of a pencil's profile that its rays are between: `lower` of the row `at`, `upper` of the next. */
@@ -299,37 +340,63 @@ static __device__ __forceinline__ void leaning_leave(int now, leaning_sums &s)
 	}
 }
 
-/* Adds a ray: its value, times its weights across, to the two voxels of each column that it passes between. */
-template <int AXIS, bool CLOSELY>
+/*
+ * Adds a ray: its value, times its weights across, to the two voxels of each column that it passes between. But where
+ * all is asked, the lower one's sums are written each time, the last time complete.
+ */
+template <int AXIS, pencil_care CARE>
 static __device__ __forceinline__ void leaning_add(const leaning_pencil &p, const matched_run &run,
-						   const slice_axes &axes, float r, float value, leaning_sums &s)
+						   const slice_axes &axes, float r, float value, float *profile,
+						   leaning_sums &s)
 {
 	float inverse = reciprocal(at_row(p.rays.along, r)), up = at_row(p.rays.up, r) * inverse;
 	float y = at_row(p.rays.across, r) * inverse, slope = at_row(p.rays.slope, r) * inverse, above;
-	float weight[LEANING_COLUMNS];
+	float slope_inverse = reciprocal(fabsf(slope));
 
-	if (CLOSELY)
+	if (CARE == CARE_ALL)
 		value *= leaning_part<AXIS>(p, run, axes, r, inverse, y, slope, up);
-	leaning_weights(y, fabsf(slope), weight);
+	if (CARE == CARE_SIDES)
+		value *= part_between(y + p.centred, slope_inverse, axes.fast);
+	if (CARE == CARE_ENDS)
+		value *= part_at_ends(run, axes, at_row(p.rays.rise, r) * inverse, up);
 	int now = split(up, above);
-	const bool moved = now > s.at;
+	const bool moved = now > s.at, beyond = y >= 1.0f;
+	const four_weights w = weights_of(beyond ? y - 1.0f : y, fabsf(slope), slope_inverse);
 	float over = above * value, under = value - over;
 
-	if (moved)
+	if (CARE == CARE_ALL && moved)
 		leaning_leave(now, s);
+	if (moved)
 #pragma unroll
-	for (int q = 0; q < LEANING_COLUMNS; q++) {
-		s.lower[q] = fmaf(under, weight[q], moved ? s.upper[q] : s.lower[q]);
-		s.upper[q] = fmaf(over, weight[q], moved ? 0.0f : s.upper[q]);
+		for (int q = 0; q < LEANING_COLUMNS; q++) {
+			s.lower[q] = s.upper[q];
+			s.upper[q] = 0;
+		}
+	/* The four of them count for the first four columns or for the last. */
+	if (!beyond) {
+		s.lower[0] = fmaf(under, w.of[0], s.lower[0]);
+		s.upper[0] = fmaf(over, w.of[0], s.upper[0]);
 	}
-	if (moved) {
+#pragma unroll
+	for (int q = 1; q < LEANING_COLUMNS - 1; q++) {
+		const float weight = beyond ? w.of[q - 1] : w.of[q];
+
+		s.lower[q] = fmaf(under, weight, s.lower[q]);
+		s.upper[q] = fmaf(over, weight, s.upper[q]);
+	}
+	if (beyond) {
+		s.lower[4] = fmaf(under, w.of[3], s.lower[4]);
+		s.upper[4] = fmaf(over, w.of[3], s.upper[4]);
+	}
+	if (CARE == CARE_ALL && moved)
 		s.row += LEANING_COLUMNS * (now - s.at);
-		s.at = now;
-	}
+	if (CARE != CARE_ALL && (unsigned)now < LEANING_RUN)
+		leaning_put(profile + LEANING_COLUMNS * now, s.lower);
+	s.at = CARE == CARE_ALL ? max(now, s.at) : now;
 }
 
 /* Makes a pencil's profile. Rays behind its last one lie above the run, or are the zeros behind the detector. */
-template <int AXIS, bool CLOSELY>
+template <int AXIS, pencil_care CARE>
 static __device__ __forceinline__ void leaning_walk(const leaning_pencil &p, const matched_run &run,
 						    const slice_axes &axes, float *profile)
 {
@@ -350,22 +417,25 @@ static __device__ __forceinline__ void leaning_walk(const leaning_pencil &p, con
 			next[i] = *row;
 #pragma unroll
 		for (int i = 0; i < LEANING_AHEAD; i++, r += p.sign)
-			leaning_add<AXIS, CLOSELY>(p, run, axes, r, ahead[i], s);
+			leaning_add<AXIS, CARE>(p, run, axes, r, ahead[i], profile, s);
 #pragma unroll
 		for (int i = 0; i < LEANING_AHEAD; i++)
 			ahead[i] = next[i];
 	}
-	if (s.at < LEANING_RUN)
+	if (CARE == CARE_ALL && s.at < LEANING_RUN)
 		leaning_leave(LEANING_RUN + 1, s);
 }
 
-/* Calls take(pencil in hand, column of it) for those from `base` on that have something for the thread's run. */
+/*
+ * Calls take(pencil in hand, column of it) for those from `base`, of the view v, on that have something for the
+ * thread's run.
+ */
 template <int COLUMNS, typename TAKE>
-static __device__ __forceinline__ void pencils_take(const pencil_row &row, int base, int until, TAKE take)
+static __device__ __forceinline__ void pencils_take(const pencil_row &row, int v, int base, int until, TAKE take)
 {
-	const int j = (int)threadIdx.x, last = pencils_view_of(row, until - 1);
+	const int j = (int)threadIdx.x;
 
-	for (int v = pencils_view_of(row, base); v <= last; v++) {
+	for (; v < PENCILS_VIEWS && row.start[v] < until; v++) {
 		const int begin = max(row.start[v], base) - base, end = min(row.start[v + 1], until) - base;
 		float guess = ((float)(j + 2 - COLUMNS) - row.views[v].place) * row.views[v].inverse;
 		int i = min(max(row.start[v] - base + (int)floorf(guess), begin), end);
@@ -395,18 +465,26 @@ static __device__ __forceinline__ void leaning_thread(const matched_job &job, co
 		__syncthreads();
 		const int total = tile.row.start[PENCILS_VIEWS];
 
-		for (int base = 0; base < total; base += PENCILS_WIDE) {
+		for (int base = 0, view = 0; base < total; base += LEANING_WIDE) {
 			const bool has = base + thread < total;
 			leaning_pencil p = {};
 
+			view = pencils_view_of(tile.row, base, view);
 			if (has)
-				leaning_begin<AXIS>(job, run, axes, first, base + thread, wide, tile, p);
-			if (__any_sync(~0u, has && (ends || p.closely)))
-				leaning_walk<AXIS, true>(p, run, axes, tile.profile[thread]);
+				leaning_begin<AXIS>(job, run, axes, first,
+						    pencils_view_of(tile.row, base + thread, view), base + thread, wide,
+						    tile, p);
+			const bool beside = __any_sync(~0u, p.beside);
+			if (__any_sync(~0u, p.closely) || (ends && beside))
+				leaning_walk<AXIS, CARE_ALL>(p, run, axes, tile.profile[thread]);
+			else if (ends)
+				leaning_walk<AXIS, CARE_ENDS>(p, run, axes, tile.profile[thread]);
+			else if (beside)
+				leaning_walk<AXIS, CARE_SIDES>(p, run, axes, tile.profile[thread]);
 			else
-				leaning_walk<AXIS, false>(p, run, axes, tile.profile[thread]);
+				leaning_walk<AXIS, CARE_NONE>(p, run, axes, tile.profile[thread]);
 			__syncthreads();
-			pencils_take<LEANING_COLUMNS>(tile.row, base, min(base + PENCILS_WIDE, total),
+			pencils_take<LEANING_COLUMNS>(tile.row, view, base, min(base + LEANING_WIDE, total),
 						      [&](int i, int q) {
 							      const float *column = &tile.profile[i][q];
 #pragma unroll
@@ -420,12 +498,13 @@ static __device__ __forceinline__ void leaning_thread(const matched_job &job, co
 
 /* ---- upright ---- */
 
+enum { UPRIGHT_WIDE = 64, UPRIGHT_BLOCKS = 10 }; /* as LEANING_WIDE, LEANING_BLOCKS */
 enum { UPRIGHT_RUN = 32, UPRIGHT_COLUMNS = 4 };
-enum { UPRIGHT_AHEAD = 4 }; /* rays of a pencil that are loaded before they are used */
+enum { UPRIGHT_AHEAD = 4 }; /* as LEANING_AHEAD */
 
 struct upright_tile {
-	float2 profile[PENCILS_WIDE][UPRIGHT_RUN / 2 + 1];
-	float weight[PENCILS_WIDE][UPRIGHT_COLUMNS + 1];
+	float2 profile[UPRIGHT_WIDE][UPRIGHT_RUN / 2 + 1];
+	float weight[UPRIGHT_WIDE][UPRIGHT_COLUMNS + 1];
 	pencil_row row;
 };
 
@@ -448,13 +527,25 @@ static __device__ __forceinline__ void upright_leave(int now, upright_sums &s)
 	}
 }
 
-/* Makes the profile of the pencil `item` of the row, and its weights. */
-template <int AXIS, bool ENDS>
-static __device__ __forceinline__ void upright_walk(const matched_job &job, const matched_run &run,
-						    const slice_axes &axes, int first_view, int item,
-						    upright_tile &tile)
+/* A pencil before its first ray. */
+struct upright_pencil {
+	int count;
+	const float *row;
+	ptrdiff_t step;
+	float r, sign;
+	changing up;              /* of a ray, voxels above the run's first */
+	float inverse, inside[2]; /* of `along`; between which sides it crosses the slice */
+	changing rise;
+	bool closely; /* some row of voxels has no ray just above it, or an end and a side may cut a ray */
+};
+
+/* Finds the weights of the pencil `item` of the row, of its view v, and sets out on it. */
+template <int AXIS>
+static __device__ __forceinline__ void upright_begin(const matched_job &job, const matched_run &run,
+						     const slice_axes &axes, int first_view, int v, int item, bool ends,
+						     upright_tile &tile, upright_pencil &ret)
 {
-	const int v = pencils_view_of(tile.row, item), thread = (int)threadIdx.x;
+	const int thread = (int)threadIdx.x;
 	const pencils_view &view = tile.row.views[v];
 	const int column = view.first + view.step * (item - tile.row.start[v]);
 	const float half = 0.5f * (float)(job.rows - 1), margin = 1e-3f;
@@ -465,56 +556,95 @@ static __device__ __forceinline__ void upright_walk(const matched_job &job, cons
 	const bool upwards = apart > 0;
 	int first = (int)ceilf(fmaxf(fminf(low, high) - margin, -half) + half);
 	int last = (int)floorf(fminf(fmaxf(low, high) + margin, half) + half);
-	const ptrdiff_t step = upwards ? job.pitch : -(ptrdiff_t)job.pitch;
-	const float *row =
-	    job.from + (size_t)(first_view + v) * job.slot + (ptrdiff_t)(upwards ? first : last) * job.pitch + column;
-	float r = (float)(upwards ? first : last) - half, sign = upwards ? 1.0f : -1.0f;
-	float from = -0.5f, to = 0.5f, weight[LEANING_COLUMNS], right;
-	upright_sums s = {-2, &tile.profile[thread][0].x - 2, 0, 0};
+	float from = -0.5f, to = 0.5f, right;
 	int left = split(y, right) - 1, j = run.fast + left + 1;
 
-	if (j <= 0 || j >= axes.fast - 2)
+	ret.count = last - first + 1;
+	ret.step = upwards ? job.pitch : -(ptrdiff_t)job.pitch;
+	ret.row =
+	    job.from + (size_t)(first_view + v) * job.slot + (ptrdiff_t)(upwards ? first : last) * job.pitch + column;
+	ret.r = (float)(upwards ? first : last) - half;
+	ret.sign = upwards ? 1.0f : -1.0f;
+	ret.up = {up, apart};
+	ret.inverse = inverse;
+	ret.rise = p.rise;
+	const bool beside = j <= 0 || j >= axes.fast - 2;
+	ret.closely = (ends && beside) || !is_seamless(low, high, half, UPRIGHT_RUN);
+	if (beside)
 		pencils_clip(y + (float)run.fast - 0.5f * (float)(axes.fast - 1), slope, 0.5f * (float)axes.fast, from,
 			     to);
-	float part = pencils_is_of_axis<AXIS>(p, 0) ? (ENDS ? 1.0f : fmaxf(to - from, 0.0f)) : 0.0f;
-	leaning_weights(right, fabsf(slope), weight);
+	ret.inside[0] = from;
+	ret.inside[1] = to;
+	float part = pencils_is_of_axis<AXIS>(p, 0) ? (ends ? 1.0f : fmaxf(to - from, 0.0f)) : 0.0f;
+	const four_weights weights = weights_of(right, fabsf(slope), reciprocal(fabsf(slope)));
 #pragma unroll
 	for (int q = 0; q < UPRIGHT_COLUMNS; q++)
-		tile.weight[thread][q] = part * weight[q];
+		tile.weight[thread][q] = part * weights.of[q];
+	if (beside) { /* columns beside the grid go to the outer ones */
+		float *weight = tile.weight[thread];
+		const int least = -(run.fast + left), most = axes.fast - 1 - (run.fast + left);
+
+		for (int q = 0; q < least && least < UPRIGHT_COLUMNS; q++)
+			weight[least] += weight[q];
+		for (int q = UPRIGHT_COLUMNS - 1; q > most && most >= 0; q--)
+			weight[most] += weight[q];
+	}
 	tile.row.left[thread] = (short)left;
-	for (int n = first; n <= last; n += UPRIGHT_AHEAD) {
-		float value[UPRIGHT_AHEAD];
+}
+
+/* Makes a pencil's profile, with CARE as leaning_add; what sides do is in the weights but for CARE_ALL at the ends. */
+template <pencil_care CARE>
+static __device__ __forceinline__ void upright_walk(const upright_pencil &p, const matched_run &run,
+						    const slice_axes &axes, bool ends, float *profile)
+{
+	const float *row = p.row;
+	float r = p.r, ahead[UPRIGHT_AHEAD] = {};
+	upright_sums s = {-2, profile - 2, 0, 0};
+
+	if (p.count > 0) {
+#pragma unroll
+		for (int i = 0; i < UPRIGHT_AHEAD; i++, row += p.step)
+			ahead[i] = *row;
+	}
+	for (int n = p.count; n > 0; n -= UPRIGHT_AHEAD) {
+		float next[UPRIGHT_AHEAD];
 
 #pragma unroll
-		for (int i = 0; i < UPRIGHT_AHEAD; i++, row += step)
-			value[i] = *row;
+		for (int i = 0; i < UPRIGHT_AHEAD; i++, row += p.step)
+			next[i] = *row;
 #pragma unroll
-		for (int i = 0; i < UPRIGHT_AHEAD; i++, r += sign) {
-			float here = fmaf(r, apart, up), above;
+		for (int i = 0; i < UPRIGHT_AHEAD; i++, r += p.sign) {
+			float here = at_row(p.up, r), value = ahead[i], above;
 
-			if (ENDS) {
-				float begin = from, end = to;
+			if (CARE == CARE_ENDS)
+				value *= part_at_ends(run, axes, at_row(p.rise, r) * p.inverse, here);
+			if (CARE == CARE_ALL && ends) {
+				float begin = p.inside[0], end = p.inside[1];
 
 				pencils_clip(here + (float)run.row - 0.5f * (float)(axes.rows - 1),
-					     at_row(p.rise, r) * inverse, 0.5f * (float)axes.rows, begin, end);
-				value[i] *= fmaxf(end - begin, 0.0f);
+					     at_row(p.rise, r) * p.inverse, 0.5f * (float)axes.rows, begin, end);
+				value *= fmaxf(end - begin, 0.0f);
 				here = fminf(fmaxf(here, (float)-run.row), (float)(axes.rows - 1 - run.row));
 			}
 			int now = split(here, above);
 			const bool moved = now > s.at;
-			float over = above * value[i], under = value[i] - over;
+			float over = above * value, under = value - over;
 
-			if (moved)
+			if (CARE == CARE_ALL && moved)
 				upright_leave(now, s);
 			s.lower = under + (moved ? s.upper : s.lower);
 			s.upper = over + (moved ? 0.0f : s.upper);
-			if (moved) {
+			if (CARE == CARE_ALL && moved)
 				s.row += now - s.at;
-				s.at = now;
-			}
+			if (CARE != CARE_ALL && (unsigned)now < UPRIGHT_RUN)
+				profile[now] = s.lower;
+			s.at = CARE == CARE_ALL ? max(now, s.at) : now;
 		}
+#pragma unroll
+		for (int i = 0; i < UPRIGHT_AHEAD; i++)
+			ahead[i] = next[i];
 	}
-	if (s.at < UPRIGHT_RUN)
+	if (CARE == CARE_ALL && s.at < UPRIGHT_RUN)
 		upright_leave(UPRIGHT_RUN + 1, s);
 }
 
@@ -534,14 +664,25 @@ static __device__ __forceinline__ void upright_thread(const matched_job &job, co
 		__syncthreads();
 		const int total = tile.row.start[PENCILS_VIEWS];
 
-		for (int base = 0; base < total; base += PENCILS_WIDE) {
-			if (base + thread < total && ends)
-				upright_walk<AXIS, true>(job, run, axes, first, base + thread, tile);
-			else if (base + thread < total)
-				upright_walk<AXIS, false>(job, run, axes, first, base + thread, tile);
+		for (int base = 0, view = 0; base < total; base += UPRIGHT_WIDE) {
+			const bool has = base + thread < total;
+			upright_pencil p = {};
+
+			view = pencils_view_of(tile.row, base, view);
+			if (has)
+				upright_begin<AXIS>(job, run, axes, first,
+						    pencils_view_of(tile.row, base + thread, view), base + thread, ends,
+						    tile, p);
+			float *profile = &tile.profile[thread][0].x;
+			if (__any_sync(~0u, p.closely))
+				upright_walk<CARE_ALL>(p, run, axes, ends, profile);
+			else if (ends)
+				upright_walk<CARE_ENDS>(p, run, axes, ends, profile);
+			else
+				upright_walk<CARE_NONE>(p, run, axes, ends, profile);
 			__syncthreads();
 			pencils_take<UPRIGHT_COLUMNS>(
-			    tile.row, base, min(base + PENCILS_WIDE, total), [&](int i, int q) {
+			    tile.row, view, base, min(base + UPRIGHT_WIDE, total), [&](int i, int q) {
 				    const float weight = tile.weight[i][q];
 #pragma unroll
 				    for (int k = 0; k < UPRIGHT_RUN / 2; k++) {

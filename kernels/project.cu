@@ -102,9 +102,11 @@ static const int GENERAL_BLOCKS = 4;
 #else
 static const int GENERAL_BLOCKS = 5;
 #endif
+static const int FLOAT_BLOCKS = 4; /* in float: loads on their way need registers */
 
 template <typename T, bool ALONG_Z>
-static __global__ void __launch_bounds__(32 * GENERAL_ROWS * GENERAL_VIEWS, GENERAL_BLOCKS)
+static __global__ void __launch_bounds__(32 * GENERAL_ROWS * GENERAL_VIEWS,
+					 std::is_same<T, float>::value ? FLOAT_BLOCKS : GENERAL_BLOCKS)
     project_general(const projection p)
 {
 	place at = place_of<GENERAL_VIEWS>(p);
