@@ -215,6 +215,7 @@ static int start_parts(const struct config *config, struct api *api, struct erro
 	    .workers = given > 0 ? given : (int)config->workers,
 	    .devices = given > 0 ? devices : NULL,
 	    .devices_per_job = config->devices_per_job > 0 ? (int)config->devices_per_job : DEVICES_ALL,
+	    .keep_devices = config->keep_devices,
 	    .threads = (int)config->threads,
 	    .device_memory = config->device_memory,
 	    .fallback = strcmp(config->fallback, "cpu") == 0,

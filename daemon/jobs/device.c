@@ -285,7 +285,8 @@ static void tell_devices(struct supervise *supervise)
 	supervise->memory_count = count;
 	/* Without other hosts a job that was posted when there were more devices goes on with those that are left. */
 	jobs_set_devices(supervise->jobs, supervise->options.remote.host, memory, count,
-			 supervise->options.remote.program != NULL ? supervise->regular : CARDS_MOST);
+			 supervise->options.remote.program != NULL ? supervise->regular : CARDS_MOST,
+			 supervise->options.keep_devices);
 }
 
 void devices_tend(struct supervise *supervise)

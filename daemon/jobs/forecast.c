@@ -2,10 +2,11 @@
  * How long jobs still take: job_eta and job_start_in of job.h.
  *
  * A running job is judged by its own iterations. What has not begun is judged by jobs before it: each stage of a job
- * that succeeded gives seconds a unit of work on that kind of device, and a stage of the same kind takes as many. Where
- * a stage was never measured, or iterations end by themselves, nobody can know.
+ * that succeeded gives seconds a unit of work on so many devices of that kind, and a stage of the same kind takes as
+ * many. Where a stage was never measured on as many devices, or iterations end by themselves, nobody can know.
  */
 #include <math.h>
+#include <stdlib.h>
 #include <string.h>
 
 #include "core/recon/algorithm.h"
@@ -56,12 +57,12 @@ static void work_of(const struct recipe *recipe, const struct job_extent *extent
 	ret_work[STAGE_SAVE] = voxels * (recipe->emits + 1);
 }
 
-static struct job_rate *rate_of(struct jobs *jobs, const struct recipe *recipe, enum stage stage)
+static struct job_rate *rate_of(struct jobs *jobs, const struct recipe *recipe, enum stage stage, int devices)
 {
 	for (int i = 0; i < jobs->rates; i++) {
 		struct job_rate *rate = &jobs->rate[i];
 
-		if (rate->stage == stage && rate->variant == variant_of(recipe, stage))
+		if (rate->stage == stage && rate->variant == variant_of(recipe, stage) && rate->devices == devices)
 			return rate;
 	}
 	return NULL;
@@ -73,10 +74,21 @@ static bool refines(const struct recipe *recipe)
 	return recipe->refine.geometry || recipe->refine.motion;
 }
 
+/* The devices that the job runs on, or that it will begin with, as far as that is known now. */
+static int devices_of(const struct job *job)
+{
+	const int wanted = job->request.devices, there = job->jobs->devices;
+
+	if (job->record.state == JOB_RUNNING)
+		return job_devices(&job->record);
+	return (wanted == DEVICES_ALL || wanted > there) && there > 0 ? there : wanted > 1 ? wanted : 1;
+}
+
 void job_measure(struct job *job, const struct job_record *record)
 {
 	const struct recipe *recipe = &job->request.recipe;
 	struct jobs *jobs = job->jobs;
+	const int devices = job_devices(record);
 	double work[STAGE_COUNT];
 
 	/* Of a lost run, or of one that went along with the acquisition, the times are not those of the work. */
@@ -87,7 +99,7 @@ void job_measure(struct job *job, const struct job_record *record)
 		return;
 	work_of(recipe, &job->extent, record->iteration, work);
 	for (enum stage stage = 0; stage < STAGE_COUNT; stage++) {
-		struct job_rate *rate = rate_of(jobs, recipe, stage);
+		struct job_rate *rate = rate_of(jobs, recipe, stage, devices);
 
 		if (!(work[stage] > 0))
 			continue;
@@ -95,12 +107,13 @@ void job_measure(struct job *job, const struct job_record *record)
 			rate = &jobs->rate[jobs->rates++];
 		else if (rate == NULL)
 			rate = &jobs->rate[jobs->oldest_rate++ % JOB_RATES];
-		*rate = (struct job_rate){stage, variant_of(recipe, stage), record->seconds[stage] / work[stage]};
+		*rate =
+		    (struct job_rate){stage, variant_of(recipe, stage), devices, record->seconds[stage] / work[stage]};
 	}
 }
 
-/* Seconds on a device from beginning to end; NAN: nobody knows. jobs->lock is held. */
-static double whole(struct job *job)
+/* Seconds on so many devices from beginning to end; NAN: nobody knows. jobs->lock is held. */
+static double whole(struct job *job, int devices)
 {
 	const struct recipe *recipe = &job->request.recipe;
 	double work[STAGE_COUNT], seconds = 0;
@@ -110,7 +123,7 @@ static double whole(struct job *job)
 		return NAN;
 	work_of(recipe, &job->extent, recipe->algorithm != NULL ? recipe->iterate.iterations : 0, work);
 	for (enum stage stage = 0; stage < STAGE_COUNT; stage++) {
-		const struct job_rate *rate = rate_of(job->jobs, recipe, stage);
+		const struct job_rate *rate = rate_of(job->jobs, recipe, stage, devices);
 
 		if (work[stage] > 0 && rate == NULL)
 			return NAN;
@@ -125,7 +138,7 @@ static double rest(struct job *job, double now)
 {
 	const struct job_record *record = &job->record;
 	const bool automatic = job->unreadable.code == 0 && job->request.recipe.iterate.automatic;
-	const double done = record->fraction - job->run_fraction, first = whole(job);
+	const double done = record->fraction - job->run_fraction, first = whole(job, devices_of(job));
 	double left = NAN;
 
 	/* How many iterations end by themselves, the share that is done tells. */
@@ -138,19 +151,71 @@ static double rest(struct job *job, double now)
 	return left < 0 ? 0 : left;
 }
 
-/* What the jobs that run still take; the newest ones run, so that old jobs are not looked at. */
-static double all_rest(const struct jobs *jobs, double now)
-{
-	double seconds = 0;
-	int left = jobs->running;
+/* When the devices here will be free, seconds from now, the soonest first. */
+struct course {
+	double free[WHERE_DEVICES_MOST];
+	int count;
+	double turn;  /* nobody begins before those who are before him in the queue */
+	bool unknown; /* how long somebody before them takes, nobody can know */
+};
 
-	for (int i = jobs->count - 1; i >= 0 && left > 0; i--) {
-		if (jobs->all[i]->record.state != JOB_RUNNING)
-			continue;
-		seconds += rest(jobs->all[i], now);
-		left--;
+static int sooner(const void *a, const void *b)
+{
+	const double x = *(const double *)a, y = *(const double *)b;
+
+	return (x > y) - (x < y);
+}
+
+/*
+ * The next job's turn: when the devices that it wants are free, or, with those that are free by then, when the first of
+ * them have been kept for it as long as they are. Returns how many it has.
+ */
+static int course_turn(struct course *course, const struct job *job, double now)
+{
+	const double kept = job->lacks_devices > 0 ? now - job->lacks_devices : 0;
+	int devices = devices_of(job);
+	double latest;
+
+	devices = devices > course->count ? course->count : devices;
+	latest = fmax(course->turn, course->free[0]) + fmax(job->jobs->keep_devices - kept, 0);
+	while (devices > 1 && course->free[devices - 1] > latest) {
+		course->turn = latest;
+		devices--;
 	}
-	return seconds;
+	course->turn = fmax(course->turn, course->free[devices - 1]);
+	return devices;
+}
+
+static void course_take(struct course *course, int devices, double seconds)
+{
+	for (int i = 0; i < devices; i++)
+		course->free[i] = course->turn + seconds;
+	course->unknown |= isnan(seconds);
+	qsort(course->free, (size_t)course->count, sizeof(course->free[0]), sooner);
+}
+
+/* By what runs here now; the newest jobs run, so that old ones are not looked at. */
+static void course_begin(const struct jobs *jobs, double now, struct course *ret)
+{
+	int left = jobs->running, running = 0;
+
+	*ret = (struct course){.count = 0};
+	for (int i = jobs->count - 1; i >= 0 && left > 0; i--) {
+		struct job *job = jobs->all[i];
+		double seconds;
+
+		if (job->record.state != JOB_RUNNING)
+			continue;
+		left--;
+		if (job->record.ran_on[0] == '\0')
+			continue; /* another host has it */
+		seconds = rest(job, now);
+		ret->unknown |= isnan(seconds);
+		for (int d = job_devices(&job->record); d > 0 && running < WHERE_DEVICES_MOST; d--)
+			ret->free[running++] = seconds;
+	}
+	ret->count = running > jobs->devices ? running : jobs->devices > 1 ? jobs->devices : 1;
+	qsort(ret->free, (size_t)ret->count, sizeof(ret->free[0]), sooner);
 }
 
 /* It is queued, and a device here will come to it. */
@@ -159,17 +224,27 @@ static bool is_coming(const struct job *job)
 	return job->record.state == JOB_QUEUED && job->hold.obstacle == JOB_UNHINDERED && !job->entry.elsewhere;
 }
 
-/* A queued job's seconds until a device is free for it. */
-static double wait_of(struct job *job, double now)
+/* A queued job's seconds until it has its devices, *ret_devices of them. */
+static double wait_of(struct job *job, double now, int *ret_devices)
 {
-	const struct jobs *jobs = job->jobs;
-	double ahead = all_rest(jobs, now);
+	struct course course;
 
+	course_begin(job->jobs, now, &course);
 	/* By priority, then by ticket. */
-	for (struct queue_entry *entry = jobs->queue.first; entry != NULL && entry != &job->entry; entry = entry->next)
-		if (!entry->elsewhere)
-			ahead += whole(job_of_entry(entry)) * (1 - job_of_entry(entry)->record.fraction);
-	return jobs->running > 1 ? ahead / jobs->running : ahead;
+	for (struct queue_entry *entry = job->jobs->queue.first;
+	     entry != NULL && entry != &job->entry && !course.unknown; entry = entry->next) {
+		struct job *before = job_of_entry(entry);
+		int devices;
+
+		if (entry->elsewhere)
+			continue;
+		devices = course_turn(&course, before, now);
+		course_take(&course, devices, whole(before, devices) * (1 - before->record.fraction));
+	}
+	if (course.unknown)
+		return NAN;
+	*ret_devices = course_turn(&course, job, now);
+	return course.turn;
 }
 
 static double known(double seconds)
@@ -180,10 +255,11 @@ static double known(double seconds)
 double job_start_in(struct job *job)
 {
 	double now = clock_monotonic(), seconds = NAN;
+	int devices = 1;
 
 	pthread_mutex_lock(&job->jobs->lock);
 	if (is_coming(job))
-		seconds = wait_of(job, now);
+		seconds = wait_of(job, now, &devices);
 	pthread_mutex_unlock(&job->jobs->lock);
 	return known(seconds);
 }
@@ -191,12 +267,15 @@ double job_start_in(struct job *job)
 double job_eta(struct job *job)
 {
 	double now = clock_monotonic(), seconds = NAN;
+	int devices = 1;
 
 	pthread_mutex_lock(&job->jobs->lock);
-	if (job->record.state == JOB_RUNNING)
+	if (job->record.state == JOB_RUNNING) {
 		seconds = rest(job, now);
-	else if (is_coming(job))
-		seconds = wait_of(job, now) + whole(job) * (1 - job->record.fraction);
+	} else if (is_coming(job)) {
+		seconds = wait_of(job, now, &devices);
+		seconds += whole(job, devices) * (1 - job->record.fraction);
+	}
 	pthread_mutex_unlock(&job->jobs->lock);
 	return known(seconds);
 }

@@ -82,6 +82,7 @@ static int make_start(struct supervise *supervise, const struct job *job, const 
 struct chosen {
 	struct worker *cards[CARDS_MOST];
 	int count;
+	bool waited; /* it wanted more */
 	struct device_names names;
 };
 
@@ -153,7 +154,7 @@ static int begin_job(struct supervise *supervise, struct worker *worker, struct 
 	worker->losses = facts->losses;
 	begin(supervise, worker, job, record, message, chosen);
 	worker->work = (double)grid_voxels(&message->request.recipe.grid) * facts->count;
-	devices_tell_fewer(worker, job_trial(job), chosen->count);
+	devices_tell_fewer(worker, job_trial(job), chosen->count, chosen->waited);
 	if (worker->fallback)
 		device_tell_fallback(supervise, worker,
 				     record->iterations > message->iteration ? record->iterations - message->iteration
@@ -235,11 +236,35 @@ static struct job *choose_job(struct supervise *supervise, const struct worker *
 	return chosen;
 }
 
+/*
+ * The devices of the job that this worker is to have. The first job whose devices are not all free keeps those that
+ * are, so that jobs of single devices never go before it for ever; and they stay idle no longer than --keep-devices
+ * says, so that a job that never ends on one device does not keep the others from all work.
+ */
+static void choose_devices(struct supervise *supervise, struct worker *worker, struct job *job, bool arriving,
+			   struct chosen *ret)
+{
+	double since, until;
+
+	ret->count = devices_choose(worker, job_trial(job), ret->cards);
+	if (ret->count > 0 || arriving)
+		return;
+	since = job_lacks_devices(job);
+	until = since + supervise->options.keep_devices;
+	if (until <= clock_monotonic()) {
+		ret->count = devices_choose_free(worker, job, ret->cards);
+		ret->waited = true;
+	} else if (supervise->kept_until == 0 || until < supervise->kept_until) {
+		supervise->kept_until = until;
+	}
+}
+
 void supervise_dispatch(struct supervise *supervise)
 {
 	struct error err;
 	int code = 0;
 
+	supervise->kept_until = 0;
 	for (int i = 0; i < supervise->count && code == 0;) {
 		struct worker *worker = &supervise->workers[i];
 		struct chosen chosen = {.count = 0};
@@ -249,14 +274,8 @@ void supervise_dispatch(struct supervise *supervise)
 		if (worker_is_free(worker))
 			job = choose_job(supervise, worker, &arriving);
 		if (job != NULL)
-			chosen.count = devices_choose(worker, job_trial(job), chosen.cards);
-		/*
-		 * The first job whose devices are not all free keeps those that are, so that jobs of single devices
-		 * never go before it for ever.
-		 */
+			choose_devices(supervise, worker, job, arriving, &chosen);
 		if (chosen.count == 0) {
-			if (job != NULL && !arriving)
-				job_lacks_devices(job);
 			job_release(job);
 			i++;
 			continue;

@@ -42,7 +42,7 @@ struct job {
 	int references; /* one of them is the array's */
 	bool removed;
 	bool stays;                    /* job_stay */
-	bool lacks_devices;            /* job_lacks_devices */
+	double lacks_devices;          /* monotonic, job_lacks_devices; 0: it does not */
 	struct client *client;         /* constant; what it points to is not */
 	bool active;                   /* counted in its client's */
 	double charged;                /* monotonic: its time on a device is counted up to then */
@@ -67,6 +67,7 @@ enum { JOB_RATES = 64 };
 struct job_rate {
 	enum stage stage;
 	unsigned variant;
+	int devices; /* that it ran on */
 	double seconds;
 };
 
@@ -91,6 +92,7 @@ struct jobs {
 	char host[WHERE_HOST_SIZE];
 	double device_bytes[WHERE_DEVICES_MOST];
 	int devices, devices_most;
+	double keep_devices; /* s */
 };
 
 /* ---- jobs/offer.c ---- */
@@ -111,6 +113,8 @@ struct job *job_of_entry(const struct queue_entry *entry);
 void job_measure(struct job *job, const struct job_record *record);
 
 /* ---- jobs/share.c ---- */
+/* How many devices the job runs on, or ran on last; 1 where it is not known. */
+int job_devices(const struct job_record *record);
 /* The client's own, made where there is none; NULL: no memory. jobs->lock is held, as by the next. */
 struct client *jobs_client(struct jobs *jobs, const char *name);
 /* The job's state has changed: whether it counts among its client's, and its time up to now. */

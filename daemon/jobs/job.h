@@ -242,14 +242,20 @@ enum job_obstacle job_obstacle(struct job *job); /* any thread */
 struct job_trial *job_trial(struct job *job);
 /*
  * This host's name and the bytes that its devices have, of which each job's "where" says whether it may run here; until
- * it is called any job may. A job that wants more than `most` devices may not, whatever some of them do just now.
+ * it is called any job may. A job that wants more than `most` devices may not, whatever some of them do just now. Those
+ * that are free are kept for `keep` seconds for a job that waits for more of them.
  */
-void jobs_set_devices(struct jobs *jobs, const char *host, const double *memory, int count, int most);
+void jobs_set_devices(struct jobs *jobs, const char *host, const double *memory, int count, int most, double keep);
 /* A job that has not ended waits for the processor. */
 bool jobs_want_processor(struct jobs *jobs);
 
-/* It was its turn, and not as many devices are free as it wants; so until its state changes. */
-void job_lacks_devices(struct job *job);
+/*
+ * It is its turn, and not as many devices are free as it wants; so until its state changes. Returns since when,
+ * CLOCK_MONOTONIC.
+ */
+double job_lacks_devices(struct job *job);
+/* Bytes that no job over this scan can do without: its projections as floats, the iterate and its copy. */
+size_t job_least_bytes(const struct job *job);
 
 /* The queued job that is due, not held, and fits, or NULL; it stays queued until job_set_state. */
 struct job *jobs_next(struct jobs *jobs, const struct job_filter *filter);

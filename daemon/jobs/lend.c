@@ -52,10 +52,11 @@ static int devices_wanted(const struct worker *worker, const struct job_trial *t
 	return most > 1 ? most : 1;
 }
 
-int devices_choose(struct worker *worker, const struct job_trial *trial, struct worker *ret_cards[CARDS_MOST])
+/* Up to so many that are free, the worker's own first; returns how many. */
+static int take_free(struct worker *worker, const struct job_trial *trial, int wanted,
+		     struct worker *ret_cards[CARDS_MOST])
 {
 	struct supervise *supervise = worker->supervise;
-	const int wanted = devices_wanted(worker, trial);
 	int count = 1;
 
 	ret_cards[0] = worker;
@@ -66,7 +67,22 @@ int devices_choose(struct worker *worker, const struct job_trial *trial, struct 
 		    strcmp(other->backend, worker->backend) == 0)
 			ret_cards[count++] = other;
 	}
-	return count == wanted ? count : 0;
+	return count;
+}
+
+int devices_choose(struct worker *worker, const struct job_trial *trial, struct worker *ret_cards[CARDS_MOST])
+{
+	const int wanted = devices_wanted(worker, trial);
+
+	return take_free(worker, trial, wanted, ret_cards) == wanted ? wanted : 0;
+}
+
+int devices_choose_free(struct worker *worker, struct job *job, struct worker *ret_cards[CARDS_MOST])
+{
+	const struct job_trial *trial = job_trial(job);
+	const int count = take_free(worker, trial, devices_wanted(worker, trial), ret_cards);
+
+	return devices_have_room(worker, job, count) ? count : 0;
 }
 
 void devices_lend(struct supervise *supervise, struct worker *worker, struct worker *const cards[], int count)
@@ -128,14 +144,22 @@ void devices_name(const struct worker *worker, struct worker *const cards[], int
 		write_numbers(supervise, cards, count, false, ret->ran_on);
 }
 
-void devices_tell_fewer(struct worker *worker, const struct job_trial *trial, int count)
+void devices_tell_fewer(struct worker *worker, const struct job_trial *trial, int count, bool waited)
 {
+	const bool all = *trial->devices == DEVICES_ALL;
 	struct error ignored;
 	char text[160];
 
-	if (worker->remote || *trial->devices <= count || count == 0)
+	if (worker->remote || count == 0 || (all ? !waited : *trial->devices <= count))
 		return;
-	snprintf(text, sizeof(text), "%d of %d devices that it asks for: the others have failed, or do not answer",
-		 count, *trial->devices);
+	if (waited)
+		snprintf(
+		    text, sizeof(text),
+		    "%d of the devices that it asks for: it has waited %.0f s for the others, which other jobs had",
+		    count, worker->supervise->options.keep_devices);
+	else
+		snprintf(text, sizeof(text),
+			 "%d of %d devices that it asks for: the others have failed, or do not answer", count,
+			 *trial->devices);
 	job_add_warning(worker->job, "fewer_devices", text, &ignored);
 }

@@ -21,10 +21,10 @@ int supervise_check_devices(const struct supervise *supervise, struct job_reques
  * The memory that may come free until the job's turn; the worker looks again when it begins. A job that does not fit on
  * its cards runs out of core, with its volumes in the host's memory. Shares of the processor have one memory.
  */
-static size_t memory_available(const struct worker_facts *facts, int devices)
+static size_t memory_available(const char *backend, size_t bytes_total, int devices)
 {
-	const bool shared = strcmp(facts->backend, "cpu") == 0;
-	const size_t bytes = facts->bytes_total * (size_t)(shared ? 1 : devices);
+	const bool shared = strcmp(backend, "cpu") == 0;
+	const size_t bytes = bytes_total * (size_t)(shared ? 1 : devices);
 	struct host_memory host;
 
 	host_memory(&host);
@@ -71,6 +71,11 @@ static int memory_needed(const char *backend, int devices, const struct scan *sc
 	return 0;
 }
 
+bool devices_have_room(const struct worker *worker, const struct job *job, int count)
+{
+	return job_least_bytes(job) <= memory_available(worker->backend, worker->info.bytes_total, count);
+}
+
 int supervise_check_memory(struct supervise *supervise, const struct scan *scan, const struct job_request *request,
 			   struct recon_memory *ret_memory, struct error *err)
 {
@@ -94,7 +99,7 @@ int supervise_check_memory(struct supervise *supervise, const struct scan *scan,
 		code = memory_needed(facts[i].backend, devices, scan, recipe, &memory, err);
 		if (code != 0)
 			return code;
-		memory.available = memory_available(&facts[i], devices);
+		memory.available = memory_available(facts[i].backend, facts[i].bytes_total, devices);
 		if (memory.total <= memory.available) {
 			*ret_memory = memory;
 			return 0;

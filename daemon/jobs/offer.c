@@ -101,12 +101,13 @@ void job_place(struct job *job)
 		job->entry.choosy |= jobs->device_bytes[i] < where->memory;
 }
 
-void jobs_set_devices(struct jobs *jobs, const char *host, const double *memory, int count, int most)
+void jobs_set_devices(struct jobs *jobs, const char *host, const double *memory, int count, int most, double keep)
 {
 	pthread_mutex_lock(&jobs->lock);
 	jobs->devices_known = true;
 	snprintf(jobs->host, sizeof(jobs->host), "%s", host);
 	jobs->devices_most = most;
+	jobs->keep_devices = keep;
 	jobs->devices = count < WHERE_DEVICES_MOST ? count : WHERE_DEVICES_MOST;
 	memcpy(jobs->device_bytes, memory, (size_t)jobs->devices * sizeof(*memory));
 	for (int i = 0; i < jobs->count; i++)

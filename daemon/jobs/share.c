@@ -26,7 +26,7 @@ struct client *jobs_client(struct jobs *jobs, const char *name)
 	return client;
 }
 
-static int devices_of(const struct job_record *record)
+int job_devices(const struct job_record *record)
 {
 	int devices = 1;
 
@@ -38,7 +38,7 @@ static int devices_of(const struct job_record *record)
 static void charge(struct job *job, double now)
 {
 	if (job->charged > 0)
-		job->client->share.used += (now - job->charged) * devices_of(&job->record);
+		job->client->share.used += (now - job->charged) * job_devices(&job->record);
 	job->charged = job->record.state == JOB_RUNNING ? now : 0;
 }
 

@@ -213,7 +213,7 @@ static void show_state(struct job *job, const struct job_record *record, const s
 	pthread_mutex_lock(&jobs->lock);
 	from = job->record.state;
 	job->record = *record;
-	job->lacks_devices = false;
+	job->lacks_devices = 0;
 	jobs->running += (record->state == JOB_RUNNING) - (from == JOB_RUNNING);
 	queue_remove(&jobs->queue, &job->entry);
 	job_share(job);

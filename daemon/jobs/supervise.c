@@ -314,6 +314,8 @@ static int poll_timeout(const struct supervise *supervise, bool stopping)
 	}
 	if (!stopping && supervise->dispatch_at > 0 && supervise->dispatch_at < next)
 		next = supervise->dispatch_at;
+	if (!stopping && supervise->kept_until > 0 && supervise->kept_until < next)
+		next = supervise->kept_until;
 	if (!stopping && supervise->review_at > 0 && supervise->review_at < next)
 		next = supervise->review_at;
 	if (next == NEVER)

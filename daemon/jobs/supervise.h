@@ -43,6 +43,7 @@ struct supervise_options {
 	const char *backend;       /* "auto", "cuda", "cpu" */
 	int workers;               /* 0 = 1 */
 	int devices_per_job;       /* of jobs that do not say; DEVICES_ALL; 0 = 1 */
+	double keep_devices;       /* s that free devices are kept for a job that waits for more of them */
 	const int *devices;        /* [workers], the device of each; NULL: 0 .. workers - 1 */
 	int threads;               /* of the CPU backend; 0 = all */
 	size_t device_memory;      /* bytes a worker may use; 0 = what is free */

@@ -238,7 +238,7 @@ enum job_obstacle job_obstacle(struct job *job)
 		obstacle = JOB_NO_HOST;
 	else if (job->request.resume > 0 && job->record.state == JOB_WAITING && job->record.checkpoint == 0)
 		obstacle = JOB_NO_CHECKPOINT;
-	else if (obstacle == JOB_UNHINDERED && job->lacks_devices)
+	else if (obstacle == JOB_UNHINDERED && job->lacks_devices > 0)
 		obstacle = JOB_NO_DEVICES;
 	pthread_mutex_unlock(&job->jobs->lock);
 	return obstacle;
@@ -260,16 +260,29 @@ bool jobs_want_processor(struct jobs *jobs)
 	return want;
 }
 
-void job_lacks_devices(struct job *job)
+double job_lacks_devices(struct job *job)
 {
+	double since;
 	bool news;
 
 	pthread_mutex_lock(&job->jobs->lock);
-	news = !job->lacks_devices && job->record.state == JOB_QUEUED;
-	job->lacks_devices |= news;
+	news = job->lacks_devices == 0 && job->record.state == JOB_QUEUED;
+	if (news)
+		job->lacks_devices = clock_monotonic();
+	since = job->lacks_devices;
 	pthread_mutex_unlock(&job->jobs->lock);
 	if (news)
 		job_wake(job);
+	return since > 0 ? since : clock_monotonic();
+}
+
+size_t job_least_bytes(const struct job *job)
+{
+	const struct recipe *recipe = &job->request.recipe;
+	const double pixel = recipe->binning > 1 ? recipe->binning : 1;
+
+	return (size_t)((2 * (double)grid_voxels(&recipe->grid) + job->extent.samples / (pixel * pixel)) *
+			sizeof(float));
 }
 
 struct job *job_of_entry(const struct queue_entry *entry)

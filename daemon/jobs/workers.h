@@ -139,8 +139,9 @@ struct supervise {
 	double memory[WORKERS_MAX];       /* devices_memory, as the jobs were told of last; the thread's own */
 	int memory_count;                 /* -1: not yet */
 	double dispatch_at;               /* monotonic; the thread's own */
-	double review_at;                 /* monotonic: when jobs that are held are looked at, 0: none; its own */
-	double stop_by;                   /* monotonic: the stop's end, NEVER before it; the thread's own */
+	double kept_until; /* monotonic: when a job that waits for devices waits no longer; 0: none does */
+	double review_at;  /* monotonic: when jobs that are held are looked at, 0: none; its own */
+	double stop_by;    /* monotonic: the stop's end, NEVER before it; the thread's own */
 
 	bool held;           /* the catalogue is away, nobody is listened to and judged; its own */
 	atomic_ullong turns; /* of the thread's loop */
@@ -224,6 +225,8 @@ int devices_in_service(const struct supervise *supervise);
 /* The devices with which the job would begin on this worker, its own first; returns 0 where some of them are not free.
  */
 int devices_choose(struct worker *worker, const struct job_trial *trial, struct worker *ret_cards[CARDS_MOST]);
+/* Those that are free, for a job that has waited for more; returns 0 where they have too little memory for it. */
+int devices_choose_free(struct worker *worker, struct job *job, struct worker *ret_cards[CARDS_MOST]);
 /* The worker's new job has them until devices_return finds that it has ended. */
 void devices_lend(struct supervise *supervise, struct worker *worker, struct worker *const cards[], int count);
 void devices_return(struct supervise *supervise);
@@ -236,8 +239,12 @@ struct device_names {
 	char ran_on[CARDS_TEXT]; /* job_change.ran_on */
 };
 void devices_name(const struct worker *worker, struct worker *const cards[], int count, struct device_names *ret);
-/* The worker's job has fewer devices than it asks for: its document says so. */
-void devices_tell_fewer(struct worker *worker, const struct job_trial *trial, int count);
+/* The worker's job has fewer devices than it asks for, `waited`: it was tired of waiting. Its document says so. */
+void devices_tell_fewer(struct worker *worker, const struct job_trial *trial, int count, bool waited);
+
+/* ---- memory.c ---- */
+/* Whether what no job can do without has room on so many devices like the worker's, or in the host's memory. */
+bool devices_have_room(const struct worker *worker, const struct job *job, int count);
 
 /* ---- starve.c ---- */
 /* The worker's new process is there: which control group bounds its memory. */

@@ -147,6 +147,32 @@ test_kills_in_the_middle_change_no_bit() {
 	[ "$(digests)" = "$whole" ] || fail "the bits of an undisturbed run after the daemon was killed"
 }
 
+# A checkpoint is of no number of devices.
+test_a_job_goes_on_with_another_number_of_devices() {
+	local before after
+	start_posted --workers 2
+	undisturbed >/dev/null
+	get_volume final "$work/two.nii"
+	for counts in "3 1" "2 3"; do
+		read -r before after <<<"$counts"
+		# Again where it had ended before the daemon was killed.
+		while :; do
+			stop_daemon
+			start_posted --workers "$before" --checkpoint-seconds 0.02
+			all_idle
+			post_job "$(with "$recipe" '"devices": "all"')"
+			job_becomes '.iteration >= 2 or .state == "succeeded"'
+			stop_daemon KILL
+			start_daemon --worker "$BUILD/cbct-worker-held" --threads 1 --workers "$after"
+			wait_job succeeded
+			[ "$(json .attempts)" = 1 ] || break
+		done
+		expect_json "(.ran_on | length) == $after and ([.history[].iteration] == [range(1; 21)])"
+		get_volume final "$work/other.nii"
+		expect_number "$(cbct compare --json "$work/other.nii" "$work/two.nii" | jq .rmse)" "<" 2e-7 "difference to two devices"
+	done
+}
+
 test_devices_are_kept_for_the_job_whose_turn_it_is() {
 	local one two wide later
 	start_posted --workers 2
@@ -169,6 +195,71 @@ test_devices_are_kept_for_the_job_whose_turn_it_is() {
 	one=$(json .started)
 	req GET "/v1/jobs/$later"
 	[[ $(json .started) > $one ]] || fail "the job for two devices begins before the one that came later"
+}
+
+# Idle devices are kept for a job no longer than --keep-devices says, and it begins with them.
+test_a_job_that_has_waited_begins_with_what_is_free() {
+	local one two wide
+	start_posted --workers 3 --keep-devices 0.5
+	all_idle
+	post_job "$endless" && one=$job
+	post_job "$endless" && two=$job
+	job_becomes '.state == "running"'
+	for count in 3 '"all"'; do
+		post_job "$(with "$recipe" "\"devices\": $count")"
+		wait_job succeeded
+		expect_json '.ran_on == [2]'
+		expect_json '[.warnings[] | select(.code == "fewer_devices") | .detail] == ["1 of the devices that it asks for: it has waited 0 s for the others, which other jobs had"]'
+	done
+	cancel "$one"
+	# Two of three, and what comes behind it has its turn when these are free again.
+	post_job "$(with "$endless" '"devices": 3')" && wide=$job
+	job_becomes '.state == "running" and (.ran_on | sort == [0, 2])'
+	post_job "$recipe" && one=$job
+	job_becomes '.state == "queued" and .waiting_for == ["worker"]'
+	cancel "$wide"
+	job=$one && wait_job succeeded
+	cancel "$two"
+	# All that it wants are free: nothing is told.
+	all_idle
+	post_job "$(with "$recipe" '"devices": 3')"
+	wait_job succeeded
+	expect_json '.ran_on == [0, 1, 2] and .warnings == []'
+}
+
+# Two devices: what was measured on one of them says nothing of two, and the queue is counted device by device.
+test_forecasts_know_the_devices() {
+	local long=${endless/100000/ITERATIONS} one two wide later
+	start_posted --workers 2 --keep-devices 20
+	all_idle
+	post_job "${long/ITERATIONS/6}" && wait_job succeeded
+	post_job "${long/ITERATIONS/100000}" && one=$job
+	post_job "${long/ITERATIONS/50000}" && two=$job
+	for job in $one $two; do job_becomes '.state == "running" and .iteration > 3'; done
+	post_job "$(with "${long/ITERATIONS/40000}" '"devices": 2')" && wide=$job
+	req GET '/v1/jobs?state=queued,running'
+	# Unless it will begin with the first that is free, after 20 s.
+	expect_json '.jobs | map({(.id): .}) | add | ([.["'"$one"'", "'"$two"'"].eta_s] | sort) as $free | .["'"$wide"'"] |
+		.start_s > 0 and ((.eta_s == null) == ($free[1] <= $free[0] + 20) or ($free[1] - $free[0] - 20 | fabs) < 1)'
+	cancel "$wide"
+	for job in $one $two; do cancel "$job"; done
+	all_idle
+	post_job "$(with "${long/ITERATIONS/6}" '"devices": 2')" && wait_job succeeded
+	post_job "${long/ITERATIONS/100000}" && one=$job
+	post_job "${long/ITERATIONS/50000}" && two=$job
+	for job in $one $two; do job_becomes '.state == "running" and .iteration > 3'; done
+	post_job "$(with "${long/ITERATIONS/40000}" '"devices": 2')" && wide=$job
+	post_job "${long/ITERATIONS/6}" && later=$job
+	req GET '/v1/jobs?state=queued,running'
+	# Both devices, or the first one, once that has been kept for 20 s; then what is behind it, on the first that is free.
+	expect_json '.jobs | map({(.id): .}) | add | ([.["'"$one"'", "'"$two"'"].eta_s] | sort) as $free | .["'"$wide"'"] as $wide | .["'"$later"'"] as $later |
+		def near(other): (. - other | fabs) < 0.05 * other + 1;
+		($free[1] <= $free[0] + 20) as $both |
+		(($free[1] - $free[0] - 20 | fabs) < 1) or
+		($wide.start_s | near(if $both then $free[1] else $free[0] + 20 end)) and
+		($later.start_s | near(if $both then $wide.eta_s else [$wide.eta_s, $free[1]] | min end)) and
+		$wide.eta_s > $wide.start_s and $later.eta_s > $later.start_s'
+	for job in $later $wide $two $one; do cancel "$job"; done
 }
 
 test_stat_makes_room_and_gets_it() {
