@@ -20,7 +20,7 @@ sys.path.insert(0, str(pathlib.Path(__file__).resolve().parent.parent / "http"))
 from fleet_host import Host, wait_for
 
 HERE = pathlib.Path(__file__).resolve().parent
-# Seconds on a server's H200: the kernels of tests/bench/results (2026-11-27-h200-d87abe3.txt, any geometry) and 1 s a gigabyte for reading
+# Seconds on a server's H200: the kernels of tests/bench/results (2026-11-27-h200-b19f1f5.txt, any geometry) and 1 s a gigabyte for reading
 # and writing. Bytes: of the scan and the volume that is kept. Share: jobs a patient.
 JOBS = {
     "FDK 512^3, urgent": dict(iterations=0, size=[16, 16, 8], priority="urgent", seconds=0.064 + 1.7, gigabytes=1.2 + 0.5, share=1.0),
