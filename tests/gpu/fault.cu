@@ -1,8 +1,7 @@
 /*
- * What makes cbct-worker-faulty of the worker: TV, once the file named by
- * CBCT_FAULT is there, takes that away and writes where nothing is. A number in the file names
- * the device that does; else it is the first that comes. Linked in front of the backend's own by the linker's --wrap;
- * no other program has it.
+ * What makes cbct-worker-faulty of the worker: TV, once the file named by CBCT_FAULT is there, takes that away and
+ * writes where nothing is. A number in the file names the device that does; else it is the first that comes. Linked in
+ * front of the backend's own by the linker's --wrap; no other program has it.
  */
 #include <cstdio>
 #include <cstdlib>
