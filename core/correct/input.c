@@ -459,10 +459,10 @@ const float *input_copy_of(const struct input *input, int view)
 /* A view between two steps, as an outlier. */
 static struct outlier outlier_of(const struct step *step)
 {
-	const int blocks = (step->end[0] - step->first[0]) * (step->end[1] - step->first[1]);
+	const double share = (step->end[0] - step->first[0]) * (step->end[1] - step->first[1]);
 
 	if (step->kind == STEP_PART)
-		return (struct outlier){OUTLIER_DARK, (float)blocks / (CONTENT_BLOCKS * CONTENT_BLOCKS)};
+		return (struct outlier){OUTLIER_DARK, (float)share};
 	return (struct outlier){step->kind == STEP_LEVEL ? OUTLIER_LEVEL : OUTLIER_NONE, step->level};
 }
 

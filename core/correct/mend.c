@@ -35,11 +35,8 @@ struct mend_area mend_area_of(const struct step *step, int columns, int rows)
 	struct mend_area area;
 
 	for (int a = 0; a < 2; a++) {
-		const int first = step->first[a] > 0 ? step->first[a] - 1 : 0;
-		const int end = step->end[a] < CONTENT_BLOCKS ? step->end[a] + 1 : CONTENT_BLOCKS;
-
-		area.first[a] = (int)((long long)first * pixels[a] / CONTENT_BLOCKS);
-		area.end[a] = (int)((long long)end * pixels[a] / CONTENT_BLOCKS);
+		area.first[a] = (int)floor(fmax(0, step->first[a] - step->border) * pixels[a]);
+		area.end[a] = (int)ceil(fmin(1, step->end[a] + step->border) * pixels[a]);
 	}
 	return area;
 }

@@ -4,26 +4,24 @@
 #include "core/correct/outliers.h"
 
 /*
- * Runs of views of any length in which all of the detector, or a part of it that reaches from one edge to the next,
+ * Runs of views of any length in which all of the detector, or a band of it from edge to edge with straight borders,
  * gives another signal than before and behind: the tube gave another dose, or a part of the detector was dark or was
- * read out with another gain. Such a run begins and ends from one view to the next, and what an object does between two
- * views is little beside that: all blocks of the part step by the same line integral, or have no good sample any more,
- * the other ones do not, and behind the run all step back by as much. Views at most 10 degrees apart are held against
- * each other, and the part is calm otherwise: before the run, in it and behind it, its blocks change by a quarter
- * of the step at most. A body that comes into the picture or leaves it changes the blocks by
- * different values, one after the other, and what metal hides has no straight border from edge to edge.
+ * read out with another gain. Such a run begins and ends from one view to the next, at most 10 degrees apart, and what
+ * an object does between two views is little beside that.
  *
- * The part is a band of a quarter to three quarters of the columns or rows at an edge of the detector, with a straight
- * border, and its run turns by 120 degrees at most, or 60 where it goes dark; all of the detector may step for half of
- * the views.
+ * Bands with another signal, and views of another dose, step by one line integral (bands.h); dark bands of a quarter to
+ * three quarters of the columns or rows have no good sample any more, in all blocks at once, where those beside them
+ * have. What metal hides has no such border. The run of a band turns by 120 degrees at most, or by 60 where metal may
+ * hide it; views of another dose are half of all at most.
  */
 enum step_kind { STEP_NONE, STEP_LEVEL, STEP_PART };
 
 struct step {
 	enum step_kind kind;
-	int first[2], end[2]; /* blocks of the part, along rows and columns: first .. end - 1 */
-	int sides[2];         /* the good views before and behind the run */
-	float level;          /* line integral; INFINITY: the part has no good sample */
+	double first[2], end[2]; /* of the part, 0 to 1 of the detector's width and height */
+	double border;           /* as much beside it may be the part's, too */
+	int sides[2];            /* the good views before and behind the run */
+	float level;             /* line integral; INFINITY: the part has no good sample */
 };
 
 /*

@@ -14,7 +14,8 @@ cbct simulate "${head[@]}" --views 120 -o "$work/dense" >/dev/null || exit 1
 cp -r "$work/dense" "$work/part"
 cp -r "$work/dense" "$work/dark"
 cp -r "$work/dense" "$work/dose"
-/usr/bin/env python3 - "$work"/{good,empty,air,outliers,dense,part,dark,dose}/projections.raw <<'EOF' || exit 1
+cp -r "$work/dense" "$work/band"
+/usr/bin/env python3 - "$work"/{good,empty,air,outliers,dense,part,dark,dose,band}/projections.raw <<'EOF' || exit 1
 import array, random, sys
 random.seed(5)
 pixels, views = 64 * 48, 60
@@ -36,13 +37,15 @@ for view in range(views):
         elif view == 52:
             outliers[view * pixels + i] = good[51 * pixels + i]
 dense = array.array('f', open(sys.argv[5], 'rb').read())
-part, dark, dose = (array.array('f', dense) for _ in range(3))
+part, dark, dose, band = (array.array('f', dense) for _ in range(4))
 for at in range(50 * pixels, 80 * pixels):
     dose[at] *= 0.5
     if at < 62 * pixels and at % 64 < 32:
         part[at] *= 0.01
         dark[at] = 0
-for name, data in zip(sys.argv[6:], (part, dark, dose)):
+    if at < 70 * pixels and 40 <= at % 64 < 52:
+        band[at] *= 0.5
+for name, data in zip(sys.argv[6:], (part, dark, dose, band)):
     open(name, 'wb').write(data.tobytes())
 open(sys.argv[2], 'wb').write(empty.tobytes())
 open(sys.argv[3], 'wb').write(air.tobytes())
@@ -73,15 +76,15 @@ test_views_that_do_not_follow_are_told_and_left_out() {
 	expect_number "$(cbct compare --json "$work/outliers.nii" "$work/good.nii" | jq '.rmse / 0.0192 * 1000')" '<' 12 "RMSE in HU"
 }
 
-# Of 120 views twelve of which a half has a hundredth of its signal, or none, and thirty with half of the dose: some 180, 30
-# and 70 HU where they are believed.
+# Of 120 views twelve of which a half has a hundredth of its signal, or none, and thirty with half of the dose: some 180, 30 and 70
+# HU where they are believed; and twenty with a band of the columns at half of its signal.
 test_views_between_two_steps_are_made_whole() {
 	local row name code
 	reconstruct "$work/dense" "{\"scan\": \"SCAN\", $grid}"
 	expect_json '.warnings | all(.code != "dark_parts" and .code != "dose_steps")'
 	json '[.warnings[].code] | sort | join(" ")' >"$work/codes"
 	get_volume final "$work/dense.nii"
-	for row in 'part dark_parts ^12' 'dark dark_parts ^12' 'dose dose_steps ^30'; do
+	for row in 'part dark_parts ^12' 'dark dark_parts ^12' 'dose dose_steps ^30' 'band dark_parts ^20'; do
 		read -r name code told <<<"$row"
 		reconstruct "$work/$name" "{\"scan\": \"SCAN\", $grid}"
 		expect_json "[.warnings[] | select(.code == \"$code\") | .severity, (.detail | test(\"$told projections, the first of them is 50,\"))] == [\"caution\", true]"

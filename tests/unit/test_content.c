@@ -147,15 +147,22 @@ START_TEST(views_between_two_steps_are_found)
 	    {{ALL_OF_IT, .1}, 3, 40, 30, 0, 1},     /* less than is told */
 	    {{LEFT_HALF, 4.6}, 3, 40, 12, 12, 1},   /* a hundredth of the signal */
 	    {{LEFT_HALF, 4.6}, 4, 61, 18, 18, 1},   /* over 76 degrees */
-	    {{LEFT_HALF, 4.6}, 3, 40, 1, 1, 1},       {{LEFT_HALF, 4.6}, 3, 20, 41, 0, 1}, /* over 126 degrees */
-	    {{{0, 0}, {8, 2}, 2}, 3, 30, 10, 10, 1},                                       /* a quarter of the rows */
-	    {{{0, 0}, {8, 2}, .69}, 3, 30, 10, 0, 1}, /* the body changes by as much at its edge */
-	    {{{6, 0}, {8, 8}, -2}, 3, 30, 10, 10, 1}, /* a quarter of the columns */
-	    {{{3, 0}, {5, 8}, 2}, 3, 30, 10, 0, 1},   /* a band that lies within */
-	    {{LEFT_HALF, .3}, 3, 40, 12, 0, 1},       {{LEFT_HALF, INFINITY}, 3, 40, 12, 12, 1},
-	    {{LEFT_HALF, INFINITY}, 3, 40, 24, 0, 1}, /* over 75 degrees */
-	    {{ALL_OF_IT, .69}, 12, 5, 6, 0, 1},       /* views that are too far apart */
-	    {{LEFT_HALF, 4.6}, 3, 40, 12, 0, .4},     /* comes and goes */
+	    {{LEFT_HALF, 4.6}, 3, 40, 1, 1, 1},
+	    {{LEFT_HALF, 4.6}, 3, 20, 41, 0, 1},       /* over 126 degrees */
+	    {{{0, 0}, {8, 2}, 2}, 3, 30, 10, 10, 1},   /* a quarter of the rows */
+	    {{{0, 0}, {8, 2}, .69}, 3, 30, 10, 10, 1}, /* with half of the signal */
+	    {{{6, 0}, {8, 8}, -2}, 3, 30, 10, 10, 1},  /* a quarter of the columns */
+	    {{{3, 0}, {5, 8}, 2}, 3, 30, 10, 10, 1},   /* a band that lies within */
+	    {{{4, 0}, {6, 8}, .69}, 4, 30, 18, 18, 1}, /* with half of the signal */
+	    {{{0, 3}, {8, 4}, .69}, 4, 30, 1, 1, 1},   /* an eighth of the rows of one view */
+	    {{{4, 0}, {6, 8}, .1}, 4, 30, 18, 0, 1},
+	    {{LEFT_HALF, .1}, 3, 40, 12, 0, 1},
+	    {{LEFT_HALF, INFINITY}, 3, 40, 12, 12, 1},
+	    {{LEFT_HALF, INFINITY}, 3, 40, 24, 24, 1}, /* over 75 degrees */
+	    {{LEFT_HALF, INFINITY}, 3, 40, 41, 0, 1},  /* over 126 degrees */
+	    {{{2, 0}, {5, 8}, INFINITY}, 3, 40, 12, 12, 1},
+	    {{ALL_OF_IT, .69}, 12, 5, 6, 0, 1},   /* views that are too far apart */
+	    {{LEFT_HALF, 4.6}, 3, 40, 12, 0, .4}, /* comes and goes */
 	    {{ALL_OF_IT, 0}, 3, 0, 0, 0, 1},
 	};
 	const int views = (int)lround(360 / rows[_i].apart);
@@ -186,8 +193,8 @@ START_TEST(views_between_two_steps_are_found)
 		if (!is_in)
 			continue;
 		for (int a = 0; a < 2; a++) {
-			ck_assert_int_eq(steps[i].first[a], rows[_i].band.first[a]);
-			ck_assert_int_eq(steps[i].end[a], rows[_i].band.end[a]);
+			ck_assert_double_eq_tol(steps[i].first[a], rows[_i].band.first[a] / 8.0, 1e-9);
+			ck_assert_double_eq_tol(steps[i].end[a], rows[_i].band.end[a] / 8.0, 1e-9);
 		}
 		if (!isinf(rows[_i].band.step))
 			ck_assert_float_eq_tol(steps[i].level, (float)rows[_i].band.step,
@@ -572,7 +579,7 @@ Suite *content_suite(void)
 
 	tcase_set_timeout(tests, 60);
 	tcase_add_loop_test(tests, a_gap_among_views_of_an_object_is_found, 0, 2);
-	tcase_add_loop_test(tests, views_between_two_steps_are_found, 0, 18);
+	tcase_add_loop_test(tests, views_between_two_steps_are_found, 0, 23);
 	tcase_add_loop_test(tests, views_that_show_nothing_are_told_and_left_out, 0, TRIES);
 	tcase_add_loop_test(tests, views_that_do_not_follow_are_told_and_left_out, 0, 2 * OUTLYING);
 	tcase_add_loop_test(tests, no_view_of_an_object_is_taken_for_nothing, 0,
