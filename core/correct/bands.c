@@ -341,35 +341,19 @@ static int mark_run(const struct ring *ring, const struct band_step *band, int p
 	return count;
 }
 
-static int mark_band(const struct ring *ring, const struct band_step *band, const float *steps, struct step *ret_steps)
+/* What mark_run needs beside the ends of a run. */
+struct marking {
+	const struct ring *ring;
+	const struct band_step *band;
+	const float *steps;
+	struct step *ret_steps;
+};
+
+static int mark(void *context, int place, int end)
 {
-	int levels[3] = {0}, level = 0, before, usual, found = 0, start = 0, run = -1;
+	const struct marking *marking = context;
 
-	while (start < ring->count && !(fabsf(steps[start]) > 0))
-		start++;
-	for (int i = 0; i < ring->count; i++) {
-		const float step = steps[(start + i) % ring->count];
-
-		level += step > 0 ? 1 : step < 0 ? -1 : 0;
-		if (abs(level) <= 1)
-			levels[level + 1]++;
-	}
-	usual = levels[0] > levels[1] ? 0 : 1;
-	usual = (levels[2] > levels[usual] ? 2 : usual) - 1;
-	level = 0;
-	for (int i = 0; i <= ring->count; i++) {
-		const int place = (start + i) % ring->count;
-		const float step = steps[place];
-
-		if (step == 0 || (!ring->closed && start + i >= ring->count))
-			continue;
-		before = level;
-		level += step > 0 ? 1 : step < 0 ? -1 : 0;
-		if (run >= 0 && !isnan(step) && level == usual)
-			found += mark_run(ring, band, run, place, steps, ret_steps);
-		run = !isnan(step) && before == usual ? place : -1;
-	}
-	return found;
+	return mark_run(marking->ring, marking->band, place, end, marking->steps, marking->ret_steps);
 }
 
 static bool is_known(const struct band_step *bands, int count, const struct band_step *band)
@@ -402,7 +386,8 @@ int bands_find(const struct ring *ring, struct step *ret_steps, struct error *er
 			if (band.step < (is_whole(&band) ? LEAST_WHOLE : LEAST))
 				continue;
 			find_steps(ring, &band, steps, steps + ring->count);
-			found += mark_band(ring, &band, steps + ring->count, ret_steps);
+			found += ring_runs(ring, steps + ring->count, mark,
+					   &(struct marking){ring, &band, steps + ring->count, ret_steps});
 		}
 	free(steps);
 	return found;

@@ -463,7 +463,7 @@ static struct outlier outlier_of(const struct step *step)
 
 	if (step->kind == STEP_PART)
 		return (struct outlier){OUTLIER_DARK, (float)share};
-	return (struct outlier){step->kind == STEP_LEVEL ? OUTLIER_LEVEL : OUTLIER_NONE, step->level};
+	return (struct outlier){step->kind == STEP_ASIDE ? OUTLIER_SHIFTED : OUTLIER_LEVEL, step->level};
 }
 
 /* Line integrals behind a hardening polynomial are not another dose's by an offset. */
@@ -471,7 +471,7 @@ static bool can_mend(const struct input *input, int view, bool keeps_all)
 {
 	if (input->steps[view].kind == STEP_LEVEL)
 		return input->linearise.hardening_count == 0 && (keeps_all || input_copy_of(input, view) != NULL);
-	return keeps_all;
+	return keeps_all && input->steps[view].kind == STEP_PART;
 }
 
 /* The views between two steps. `skip`: views that are none of them; these are marked as well. */

@@ -68,3 +68,51 @@ bool ring_is_near(const struct ring *ring, int place)
 	return ring_place(ring, place) != NULL && ring_place(ring, place + 1) != NULL &&
 	       ring_turn(ring, place, place + 1) <= NEAR * PI / 180;
 }
+
+static int direction_of(float step)
+{
+	return (step > 0) - (step < 0); /* NAN is neither */
+}
+
+/*
+ * *ret_usual: the level, from -1 to 1, that most views behind a place have, being 0 before it. False unless all others
+ * have one and the same level one step away: then a step was missed.
+ */
+static bool find_usual(const struct ring *ring, const float *steps, int start, int *ret_usual)
+{
+	int views[5] = {0}, level = 0, levels = 0, usual = 1;
+
+	for (int i = 0; i < ring->count; i++) {
+		level += direction_of(steps[(start + i) % ring->count]);
+		if (abs(level) > 2)
+			return false;
+		levels += views[level + 2]++ == 0;
+	}
+	for (int i = 1; i < 5; i++)
+		usual = views[i] > views[usual] ? i : usual;
+	*ret_usual = usual - 2;
+	return levels == 2 && (views[usual - 1] > 0) + (usual < 4 && views[usual + 1] > 0) == 1 &&
+	       (!ring->closed || level == 0);
+}
+
+int ring_runs(const struct ring *ring, const float *steps, int (*mark)(void *context, int before, int last),
+	      void *context)
+{
+	int level = 0, found = 0, start = 0, run = -1, usual;
+
+	while (start < ring->count && direction_of(steps[start]) == 0)
+		start++;
+	if (start == ring->count || !find_usual(ring, steps, start, &usual))
+		return 0;
+	for (int i = 0; i <= ring->count; i++) {
+		const int place = (start + i) % ring->count, before = level;
+
+		if (steps[place] == 0 || (!ring->closed && start + i >= ring->count))
+			continue;
+		level += direction_of(steps[place]);
+		if (run >= 0 && !isnan(steps[place]) && level == usual)
+			found += mark(context, run, place);
+		run = !isnan(steps[place]) && before == usual ? place : -1;
+	}
+	return found;
+}

@@ -27,4 +27,12 @@ double ring_turn(const struct ring *ring, int from, int to);
 /* True if a place and the next one are at most 10 degrees apart: an object is much the same in both. */
 bool ring_is_near(const struct ring *ring, int place);
 
+/*
+ * steps: [count], what steps from a place to the next, by one size up or down; 0: nothing, NAN: it may. They are added
+ * up along the ring, and what most views have is right. Calls `mark` for each run of views that have one step more or
+ * less: the place before it and its last one, both from 0 to count - 1; returns the sum of what that returns.
+ */
+int ring_runs(const struct ring *ring, const float *steps, int (*mark)(void *context, int before, int last),
+	      void *context);
+
 #endif

@@ -5,6 +5,7 @@
 #include <string.h>
 
 #include "core/correct/bands.h"
+#include "core/correct/order.h"
 #include "core/error.h"
 #include "core/select.h"
 
@@ -178,6 +179,10 @@ int steps_find(const struct view_profile *views, const bool *skip, const struct 
 		found = bands_find(&ring, ret_steps, err);
 	if (ring.count >= VIEWS_LEAST && found >= 0)
 		found += mark_dark_bands(&ring, ret_steps);
+	if (ring.count >= VIEWS_LEAST && found >= 0) {
+		code = order_find_shifts(&ring, ret_steps, err);
+		found = code < 0 ? code : found + code;
+	}
 	if (MOST * found > ring.count) {
 		memset(ret_steps, 0, (size_t)orbit->count * sizeof(*ret_steps));
 		found = 0;

@@ -4,17 +4,17 @@
 #include "core/correct/outliers.h"
 
 /*
- * Runs of views of any length in which all of the detector, or a band of it from edge to edge with straight borders,
- * gives another signal than before and behind: the tube gave another dose, or a part of the detector was dark or was
- * read out with another gain. Such a run begins and ends from one view to the next, at most 10 degrees apart, and what
- * an object does between two views is little beside that.
+ * Runs of views of any length that lie aside (order.h), or in which all of the detector, or a band of it from edge to
+ * edge with straight borders, gives another signal than before and behind: the tube gave another dose, or a part of the
+ * detector was dark or was read out with another gain. Such a run begins and ends from one view to the next, at most 10
+ * degrees apart, and what an object does between two views is little beside that.
  *
  * Bands with another signal, and views of another dose, step by one line integral (bands.h); dark bands of a quarter to
  * three quarters of the columns or rows have no good sample any more, in all blocks at once, where those beside them
  * have. What metal hides has no such border. The run of a band turns by 120 degrees at most, or by 60 where metal may
  * hide it; views of another dose are half of all at most.
  */
-enum step_kind { STEP_NONE, STEP_LEVEL, STEP_PART };
+enum step_kind { STEP_NONE, STEP_LEVEL, STEP_PART, STEP_ASIDE };
 
 struct step {
 	enum step_kind kind;

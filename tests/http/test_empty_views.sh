@@ -15,7 +15,8 @@ cp -r "$work/dense" "$work/part"
 cp -r "$work/dense" "$work/dark"
 cp -r "$work/dense" "$work/dose"
 cp -r "$work/dense" "$work/band"
-/usr/bin/env python3 - "$work"/{good,empty,air,outliers,dense,part,dark,dose,band}/projections.raw <<'EOF' || exit 1
+cp -r "$work/dense" "$work/aside"
+/usr/bin/env python3 - "$work"/{good,empty,air,outliers,dense,part,dark,dose,band,aside}/projections.raw <<'EOF' || exit 1
 import array, random, sys
 random.seed(5)
 pixels, views = 64 * 48, 60
@@ -37,7 +38,7 @@ for view in range(views):
         elif view == 52:
             outliers[view * pixels + i] = good[51 * pixels + i]
 dense = array.array('f', open(sys.argv[5], 'rb').read())
-part, dark, dose, band = (array.array('f', dense) for _ in range(4))
+part, dark, dose, band, aside = (array.array('f', dense) for _ in range(5))
 for at in range(50 * pixels, 80 * pixels):
     dose[at] *= 0.5
     if at < 62 * pixels and at % 64 < 32:
@@ -45,7 +46,9 @@ for at in range(50 * pixels, 80 * pixels):
         dark[at] = 0
     if at < 70 * pixels and 40 <= at % 64 < 52:
         band[at] *= 0.5
-for name, data in zip(sys.argv[6:], (part, dark, dose, band)):
+    if at < 65 * pixels:
+        aside[at] = dense[at - min(at % 64, 5)]
+for name, data in zip(sys.argv[6:], (part, dark, dose, band, aside)):
     open(name, 'wb').write(data.tobytes())
 open(sys.argv[2], 'wb').write(empty.tobytes())
 open(sys.argv[3], 'wb').write(air.tobytes())
@@ -94,6 +97,15 @@ test_views_between_two_steps_are_made_whole() {
 		get_volume final "$work/$name.nii"
 		expect_number "$(cbct compare --json "$work/$name.nii" "$work/dense.nii" | jq '.rmse / 0.0192 * 1000')" '<' 5 "$name: RMSE in HU"
 	done
+}
+
+# Fifteen of 120 views that lie five columns aside.
+test_a_run_of_views_aside_is_told_and_left_out() {
+	reconstruct "$work/aside" "{\"scan\": \"SCAN\", $grid}"
+	expect_json '[.warnings[] | select(.code == "shifted_views") | .severity, (.detail | test("^15 projections, the first of them is 50, lie aside .* They are left out"))] == ["serious", true]'
+	[ -f "$work/dense.nii" ] || fail "the good scan was not reconstructed"
+	get_volume final "$work/aside.nii"
+	expect_number "$(cbct compare --json "$work/aside.nii" "$work/dense.nii" | jq '.rmse / 0.0192 * 1000')" '<' 20 "RMSE in HU"
 }
 
 test_a_scan_of_air_is_told() {

@@ -97,7 +97,8 @@ struct band {
 	double step;
 };
 
-static struct view_profile profile_at(double angle, const struct band *band, double share)
+/* aside: of the detector's width. */
+static struct view_profile profile_at(double angle, const struct band *band, double share, double aside)
 {
 	enum { SAMPLES = OUTLIERS_SAMPLES, EACH = CONTENT_SAMPLES };
 	struct profile_sums sums = {0};
@@ -107,7 +108,7 @@ static struct view_profile profile_at(double angle, const struct band *band, dou
 	for (int r = 0; r < SAMPLES; r++)
 		for (int c = 0; c < SAMPLES; c++) {
 			const int block = r / EACH * CONTENT_BLOCKS + c / EACH;
-			float p = body_at((c + 0.5) / SAMPLES, (r + 0.5) / SAMPLES, angle);
+			float p = body_at((c + 0.5) / SAMPLES - aside, (r + 0.5) / SAMPLES, angle);
 
 			if (share > 0 && c / EACH >= band->first[0] && c / EACH < band->end[0] &&
 			    r / EACH >= band->first[1] && r / EACH < band->end[1])
@@ -183,7 +184,8 @@ START_TEST(views_between_two_steps_are_found)
 		profiles[i] = profile_at((30 + i * rows[_i].apart) * acos(-1) / 180, &rows[_i].band,
 					 !is_in   ? 0
 					 : at_end ? rows[_i].ramp
-						  : 1);
+						  : 1,
+					 0);
 	}
 	ck_assert_int_eq(steps_find(profiles, skip, &orbit, steps, &err), rows[_i].found);
 	for (int i = 0; i < views && rows[_i].found > 0 && 2 * rows[_i].count <= views; i++) {
@@ -200,6 +202,51 @@ START_TEST(views_between_two_steps_are_found)
 			ck_assert_float_eq_tol(steps[i].level, (float)rows[_i].band.step,
 					       .1f * fabsf((float)rows[_i].band.step));
 	}
+	orbit_clear(&orbit);
+	scene_clear(&scene);
+	free(profiles);
+	free(steps);
+	free(skip);
+}
+END_TEST
+
+/* Runs that lie aside are found at their very ends; slow ways, small ones, and those of a body beyond the detector are
+ * none. */
+START_TEST(runs_of_views_that_lie_aside_are_found)
+{
+	static const struct {
+		double apart, aside; /* degrees, a full turn; of the detector's width */
+		int first, count, slow, found;
+	} rows[] = {
+	    {4, .06, 32, 4, 0, 4}, {4, -.06, 49, 18, 0, 18}, {4, -.06, 80, 18, 0, 18},
+	    {6, .06, 20, 1, 0, 1}, {4, .06, 30, 40, 0, 0}, /* too many to be left out */
+	    {4, .01, 32, 4, 0, 0}, {4, .06, 32, 18, 8, 0}, /* comes and goes within eight views */
+	    {12, .06, 5, 6, 0, 0},                         /* views that are too far apart */
+	    {4, 0, 0, 0, 0, 0},
+	};
+	const int views = (int)lround(360 / rows[_i].apart);
+	const struct orbit_spec spec = {8, 8, views, {600, 1100, {10, 10}, {0, 0}, {0, 0}}, 30, rows[_i].apart};
+	const struct band none = {{0, 0}, {0, 0}, 0};
+	struct view_profile *profiles = calloc((size_t)views, sizeof(*profiles));
+	struct step *steps = calloc((size_t)views, sizeof(*steps));
+	bool *skip = calloc((size_t)views, sizeof(*skip));
+	struct scene scene;
+	struct orbit orbit;
+	struct error err;
+
+	scene_orbit(&scene, &spec);
+	ck_assert_int_eq(orbit_analyse(&orbit, &scene.geometry, &err), 0);
+	for (int i = 0; i < views; i++) {
+		const int place = (i - rows[_i].first + views) % views, last = rows[_i].count - 1 - place;
+		const double part = rows[_i].slow > 0 ? fmin(1, (fmin(place, last) + 1) / rows[_i].slow) : 1;
+
+		profiles[i] = profile_at((30 + i * rows[_i].apart) * acos(-1) / 180, &none, 0,
+					 place < rows[_i].count ? part * rows[_i].aside : 0);
+	}
+	ck_assert_int_eq(steps_find(profiles, skip, &orbit, steps, &err), rows[_i].found);
+	for (int i = 0; i < views && rows[_i].found > 0; i++)
+		ck_assert_msg((steps[i].kind == STEP_ASIDE) == ((i - rows[_i].first + views) % views < rows[_i].count),
+			      "row %d: view %d", _i, i);
 	orbit_clear(&orbit);
 	scene_clear(&scene);
 	free(profiles);
@@ -575,11 +622,12 @@ END_TEST
 Suite *content_suite(void)
 {
 	Suite *suite = suite_create("content");
-	TCase *tests = tcase_create("content");
+	TCase *search = tcase_create("search"), *tests = tcase_create("content");
 
 	tcase_set_timeout(tests, 60);
-	tcase_add_loop_test(tests, a_gap_among_views_of_an_object_is_found, 0, 2);
-	tcase_add_loop_test(tests, views_between_two_steps_are_found, 0, 23);
+	tcase_add_loop_test(search, a_gap_among_views_of_an_object_is_found, 0, 2);
+	tcase_add_loop_test(search, views_between_two_steps_are_found, 0, 23);
+	tcase_add_loop_test(search, runs_of_views_that_lie_aside_are_found, 0, 9);
 	tcase_add_loop_test(tests, views_that_show_nothing_are_told_and_left_out, 0, TRIES);
 	tcase_add_loop_test(tests, views_that_do_not_follow_are_told_and_left_out, 0, 2 * OUTLYING);
 	tcase_add_loop_test(tests, no_view_of_an_object_is_taken_for_nothing, 0,
@@ -587,6 +635,7 @@ Suite *content_suite(void)
 	tcase_add_loop_test(tests, measured_views_all_show_something, 0, 3);
 	tcase_add_loop_test(tests, a_scan_of_air_is_told, 0, 10);
 	tcase_add_loop_test(tests, a_faint_object_in_every_view_is_no_air, 0, 8);
+	suite_add_tcase(suite, search);
 	suite_add_tcase(suite, tests);
 	return suite;
 }
