@@ -118,6 +118,15 @@ test_images_are_counted() {
 	expect_status 507
 	retry_after
 	expect_json '.detail | contains("defect map of 3072 bytes")'
+	# and so are images of scatter
+	jq '.projections += {quantity: "intensity", air: 50000, scatter: {kind: "images", columns: 20, rows: 16, every: 5}}' "$scan_dir/scan.json" >"$work/scattering.json"
+	ask POST /v1/scans -H 'Content-Type: application/json' --data-binary @"$work/scattering.json"
+	expect_status 201
+	head -c 1280 /dev/zero >"$work/scatter"
+	ask PUT "/v1/scans/$(json .id)/scatter/5" -T "$work/scatter"
+	expect_status 507
+	retry_after
+	expect_json "$(printf '.detail | contains("projection 5\x27s scatter of 1280 bytes")')"
 }
 
 test_bytes_are_taken_when_they_come() {

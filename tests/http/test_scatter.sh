@@ -2,6 +2,7 @@
 # Images of scatter that somebody else has computed: PUT and GET of each, whether they come before projections, behind
 # them, or never, a restart, damage, and the programs that send them.
 . "$(dirname "$0")/lib.sh"
+program=cbctd-held # asserts the order of locks
 
 ball=(--phantom head --scale 60 --density 0.02 --views 45 --arc 360 --columns 80 --rows 64 --pixel 3
 	--source-to-isocentre 620 --source-to-detector 1100 --raw air --sample float32)
