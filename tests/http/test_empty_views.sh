@@ -108,6 +108,51 @@ test_a_run_of_views_aside_is_told_and_left_out() {
 	expect_number "$(cbct compare --json "$work/aside.nii" "$work/dense.nii" | jq '.rmse / 0.0192 * 1000')" '<' 20 "RMSE in HU"
 }
 
+# put_view N of the spoiled scan
+put_view() {
+	local bytes=$((64 * 48 * 4))
+	dd if="$work/outliers/projections.raw" of="$work/view" bs=$bytes skip="$1" count=1 status=none
+	req PUT "/v1/scans/$scan/projections/$1" --data-binary @"$work/view"
+	expect_status 201
+}
+outcome() {
+	req GET "/v1/jobs/$job"
+	json '.warnings | sort_by(.code)[] | .code, .detail'
+	req GET "/v1/jobs/$job/volumes"
+	json '.volumes[] | .name, .digest'
+}
+
+# Spoiled views are found, and left out, to the same bits in any order of arrival, and when the worker is killed.
+test_spoiled_views_give_the_same_bits_however_they_come() {
+	local whole="{\"scan\": \"SCAN\", $grid, \"fdk\": {}, \"sart\": {\"iterations\": 4}, \"emit\": [\"fdk\"]}" late i
+	reconstruct "$work/outliers" "$whole"
+	outcome >"$work/expected"
+	# backwards, while the job waits for them
+	post_scan "$work/outliers"
+	post_job "$whole"
+	for ((i = 59; i >= 0; i--)); do put_view $i; done
+	wait_job succeeded
+	outcome | diff "$work/expected" - || fail "other bits of views that come backwards"
+	# every second one first, and the worker killed between
+	post_scan "$work/outliers"
+	post_job "$whole"
+	for ((i = 0; i < 60; i += 2)); do put_view $i; done
+	kill -9 "$(worker_of)"
+	for ((i = 1; i < 60; i += 2)); do put_view $i; done
+	wait_job succeeded
+	outcome | diff "$work/expected" - || fail "other bits behind a killed worker"
+	# killed while the job runs, which then waits for a more urgent one
+	post_job "$whole"
+	late=$job
+	state_becomes running
+	kill -9 "$(worker_of)"
+	post_job "{\"scan\": \"SCAN\", $grid, \"fdk\": {}, \"priority\": \"stat\"}"
+	wait_job succeeded
+	job=$late
+	wait_job succeeded
+	outcome | diff "$work/expected" - || fail "other bits of a job that began anew"
+}
+
 test_a_scan_of_air_is_told() {
 	reconstruct "$work/air" "{\"scan\": \"SCAN\", $grid, \"fdk\": {}}"
 	expect_json '[.warnings[] | select(.code == "no_object") | .severity] == ["serious"]'
