@@ -644,7 +644,8 @@ double input_shown(const struct input *input)
 
 double input_air_off_share(const struct input *input)
 {
-	return input->views_looked_at > 0 ? (double)input->far_off / input->views_looked_at : 0;
+	/* Between two views that are looked at, one such and the other not, all may be such. */
+	return input->far_off > 0 ? fmin(1, (input->far_off + 1.) / input->views_looked_at) : 0;
 }
 
 double input_blank_share(const struct input *input, const struct orbit *orbit)

@@ -1696,6 +1696,7 @@ static const struct {
     {"a tube at 108 %", 96, 1.08, 0, 20000},
     {"a tube that drifts by 3 %", 96, 1, 0.03, 20000},
     {"a tube that drifts by 8 %", 96, 1, 0.08, 20000},
+    {"a tube that drifts by 20 %", 96, 1, 0.2, 20000},
     {"1000 photons", 96, 1, 0, 1000},
     {"300 photons", 96, 1, 0, 300},
     {"8 columns", 8, 1, 0, 0},
