@@ -138,8 +138,11 @@ static int tiff_open(struct image_file *file, const char *path, const struct ima
 		return tiff_fail(pages, "it cannot be opened", err);
 	code = page_look(pages, &first, err);
 	file->count = 1;
-	while (code == 0 && TIFFReadDirectory(pages->tiff) == 1) {
+	while (code == 0 && !TIFFLastDirectory(pages->tiff)) {
 		pages->page++;
+		/* What is left of a page that cannot be read is none, nor is it the one before any more. */
+		if (TIFFReadDirectory(pages->tiff) != 1)
+			return tiff_fail(pages, "it cannot be read", err);
 		code = page_look(pages, &next, err);
 		if (code == 0 && (next.columns != first.columns || next.rows != first.rows || next.type != first.type))
 			code = error_set(err, ERR_INVALID, "page %d: %d x %d pixels of %s, page 0 has %d x %d of %s",
@@ -148,8 +151,6 @@ static int tiff_open(struct image_file *file, const char *path, const struct ima
 		if (code == 0 && ++file->count > VIEWS_MAX)
 			code = error_set(err, ERR_IMPOSSIBLE, "more than %d pages", VIEWS_MAX);
 	}
-	if (code == 0 && !TIFFLastDirectory(pages->tiff))
-		code = tiff_fail(pages, "the next page cannot be read", err);
 	if (code != 0)
 		return code;
 	file->columns = first.columns;
@@ -181,9 +182,12 @@ static int read_strips(struct image_file *file, float *ret_pixels, struct error 
 	struct pages *pages = file->state;
 	uint32_t rows_each = (uint32_t)file->rows, strips = TIFFNumberOfStrips(pages->tiff);
 	size_t row_bytes = (size_t)file->columns * pixel_bytes(file->type);
-	int code = make_room(pages, TIFFStripSize(pages->tiff), err);
+	int code;
 
 	TIFFGetFieldDefaulted(pages->tiff, TIFFTAG_ROWSPERSTRIP, &rows_each);
+	if (rows_each > (uint32_t)file->rows)
+		rows_each = (uint32_t)file->rows;
+	code = make_room(pages, (tmsize_t)(rows_each * row_bytes), err);
 	for (uint32_t strip = 0; strip < strips && code == 0; strip++) {
 		size_t first = (size_t)strip * rows_each, rows = (size_t)file->rows - first;
 
@@ -191,7 +195,7 @@ static int read_strips(struct image_file *file, float *ret_pixels, struct error 
 			break;
 		if (rows > rows_each)
 			rows = rows_each;
-		if (rows == 0 || rows * row_bytes > (size_t)pages->strip_bytes)
+		if (rows == 0)
 			return tiff_fail(pages, "its strips have no size", err);
 		if (TIFFReadEncodedStrip(pages->tiff, strip, pages->strip, (tmsize_t)(rows * row_bytes)) !=
 		    (tmsize_t)(rows * row_bytes))
@@ -207,12 +211,14 @@ static int read_tiles(struct image_file *file, float *ret_pixels, struct error *
 	struct pages *pages = file->state;
 	uint32_t width = 0, height = 0, columns = (uint32_t)file->columns, rows = (uint32_t)file->rows;
 	size_t bytes = pixel_bytes(file->type);
-	int code = make_room(pages, TIFFTileSize(pages->tiff), err);
+	int code;
 
 	TIFFGetField(pages->tiff, TIFFTAG_TILEWIDTH, &width);
 	TIFFGetField(pages->tiff, TIFFTAG_TILELENGTH, &height);
-	if (code == 0 && (width == 0 || height == 0 || (size_t)width * height * bytes > (size_t)pages->strip_bytes))
+	if (width < 1 || width > DETECTOR_MAX || height < 1 || height > DETECTOR_MAX ||
+	    (size_t)width * height * bytes != (size_t)TIFFTileSize(pages->tiff))
 		return tiff_fail(pages, "its tiles have no size", err);
+	code = make_room(pages, TIFFTileSize(pages->tiff), err);
 	for (uint32_t y = 0; y < rows && code == 0; y += height)
 		for (uint32_t x = 0; x < columns; x += width) {
 			uint32_t across = columns - x < width ? columns - x : width;

@@ -476,6 +476,8 @@ test_hostile_files_are_refused_with_a_reason() {
 	refused 1 "no ElementDataFile" cbct import "$work/cut.mhd" --rtk "$work/geometry.xml" "${to[@]}"
 	sed 's/ElementDataFile.*/ElementDataFile = image%03d.raw 0 19 1/' "$work/stack.mhd" >"$work/pattern.mhd"
 	refused 1 "give the folder" cbct import "$work/pattern.mhd" --rtk "$work/geometry.xml" "${to[@]}"
+	# TIFF: what is left of a page that cannot be read was taken for the first one.
+	refused 1 "page 1: it cannot be read" cbct import "$top/tests/fuzz/seeds/images/broken_page.tif" "${circle[@]}" --pixel 4 --air 5 "${to[@]}"
 	# XML
 	{
 		echo '<?xml version="1.0"?><!DOCTYPE RTKGEOMETRY ['
