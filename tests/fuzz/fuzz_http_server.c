@@ -3,6 +3,7 @@
  * targets, queries, Authorization, cookies and conditions: each connection ends, no request meets an internal error,
  * and nobody reads or changes what wants a role without showing the token, whose text the seeds have.
  */
+#include <errno.h>
 #include <poll.h>
 #include <stdatomic.h>
 #include <stdio.h>
@@ -187,6 +188,7 @@ static size_t exchange(const uint8_t *data, size_t size, char *ret_reply)
 	const int client = socket(AF_UNIX, SOCK_STREAM | SOCK_CLOEXEC, 0);
 	size_t sent = 0, length = 0;
 	ssize_t got = 1;
+	int ready;
 
 	memcpy(address.sun_path, path, strlen(path));
 	PROMISE(client >= 0 && connect(client, (const struct sockaddr *)&address, sizeof(address)) == 0);
@@ -201,7 +203,11 @@ static size_t exchange(const uint8_t *data, size_t size, char *ret_reply)
 			got = 1;
 			continue;
 		}
-		PROMISE(poll(&wait, 1, PATIENCE) == 1); /* else it hangs */
+		/* libFuzzer's own timer interrupts it every 11 s. */
+		do
+			ready = poll(&wait, 1, PATIENCE);
+		while (ready < 0 && errno == EINTR);
+		PROMISE(ready == 1); /* else it hangs */
 		got = recv(client, ret_reply + length, REPLY_MOST - length, 0);
 		length += got > 0 ? (size_t)got : 0;
 	}
