@@ -5,6 +5,7 @@
 #include <fcntl.h>
 #include <limits.h>
 #include <openssl/evp.h>
+#include <string.h>
 #include <sys/stat.h>
 #include <unistd.h>
 
@@ -126,7 +127,25 @@ static enum scatter_state state_of(const struct scatter_file *file, enum sum_sta
 	return sum->bytes == scatter_image_bytes(&file->images) ? SCATTER_STORED : SCATTER_LOST;
 }
 
-int scatter_file_states(const struct scatter_file *file, unsigned char *ret_states, struct error *err)
+/* The record says which bytes the image has, or had. */
+static bool is_known(enum sum_state state, const struct sum *sum)
+{
+	static const uint8_t none[sizeof(sum->sha256)];
+
+	return state == SUM_GOOD && memcmp(sum->sha256, none, sizeof(none)) != 0;
+}
+
+static unsigned other_of(const struct sum *sum)
+{
+	const uint8_t *sha256 = sum->sha256;
+
+	if (sum->order == 0)
+		return 0;
+	return 1u | (unsigned)sha256[0] << 8 | (unsigned)sha256[1] << 16 | (unsigned)sha256[2] << 24;
+}
+
+int scatter_file_states(const struct scatter_file *file, unsigned char *ret_states, unsigned *ret_others,
+			struct error *err)
 {
 	int code = 0;
 
@@ -135,7 +154,10 @@ int scatter_file_states(const struct scatter_file *file, unsigned char *ret_stat
 		struct sum sum;
 
 		code = sums_get(file->sums, i, 1, 0, &sum, &state, err);
+		if (code != 0)
+			break;
 		ret_states[i] = (unsigned char)state_of(file, state, &sum);
+		ret_others[i] = is_known(state, &sum) ? other_of(&sum) : 0;
 	}
 	return code;
 }
@@ -170,15 +192,39 @@ static int put_record(const struct scatter_file *file, int image, const struct s
 	return code;
 }
 
-int scatter_file_write(const struct scatter_file *file, int image, const float *pixels, struct error *err)
+int scatter_file_describe(const struct scatter_file *file, int image, const float *pixels, struct sum *ret_sum,
+			  unsigned *ret_other, struct error *err)
+{
+	const size_t bytes = scatter_image_bytes(&file->images);
+	struct sum sum = {.crc = checksum(0, pixels, bytes), .bytes = bytes}, before;
+	unsigned char state = SUM_NONE;
+	int code = sums_get(file->sums, image, 1, 0, &before, &state, err);
+
+	if (code != 0)
+		return code;
+	if (EVP_Digest(pixels, bytes, sum.sha256, NULL, EVP_sha256(), NULL) != 1)
+		return error_set(err, ERR_INTERNAL, "SHA-256 failed");
+	if (is_known(state, &before) && memcmp(before.sha256, sum.sha256, sizeof(sum.sha256)) == 0)
+		sum.order = before.order;
+	else if (is_known(state, &before) && before.lost)
+		return error_set(err, ERR_CONFLICT,
+				 "the image of projection %d's scatter was stored with other bytes, and damaged by the "
+				 "disk: it is to be sent again as it was; DELETE removes it",
+				 scatter_image_projection(&file->images, file->projections, image));
+	else
+		sum.order = state != SUM_GOOD || before.bytes != 0 || before.lost;
+	*ret_sum = sum;
+	*ret_other = other_of(&sum);
+	return 0;
+}
+
+int scatter_file_write(const struct scatter_file *file, int image, const float *pixels, const struct sum *sum,
+		       struct error *err)
 {
 	const size_t bytes = scatter_image_bytes(&file->images);
 	const off_t offset = (off_t)bytes * image;
-	struct sum sum = {.crc = checksum(0, pixels, bytes), .bytes = bytes};
 	size_t done = 0;
 
-	if (EVP_Digest(pixels, bytes, sum.sha256, NULL, EVP_sha256(), NULL) != 1)
-		return error_set(err, ERR_INTERNAL, "SHA-256 failed");
 	while (done < bytes) {
 		const ssize_t wrote =
 		    pwrite(file->samples, (const char *)pixels + done, bytes - done, offset + (off_t)done);
@@ -191,7 +237,7 @@ int scatter_file_write(const struct scatter_file *file, int image, const float *
 	}
 	if (fdatasync(file->samples) != 0)
 		return error_set_sync(err, errno, "sync " SCATTER_FILE);
-	return put_record(file, image, &sum, err);
+	return put_record(file, image, sum, err);
 }
 
 int scatter_file_lose(const struct scatter_file *file, int image, struct error *err)
@@ -223,8 +269,8 @@ int scatter_file_forget(const struct scatter_file *file, const unsigned char *fl
 
 /* ---- files that are not whole ---- */
 
-/* Into new records, in which all images are lost so far: those of the old file that are good, and images that never
- * came. */
+/* Into new records, in which all images are lost so far: those of the old file that are good, also of images that were
+ * lost, and images that never came. */
 static int copy_records(const struct scatter_file *from, const struct scatter_file *to, const unsigned char *states,
 			struct error *err)
 {
@@ -239,7 +285,7 @@ static int copy_records(const struct scatter_file *from, const struct scatter_fi
 			code = sums_get(from->sums, i, 1, 0, &sum, &state, err);
 		if (code != 0)
 			break;
-		if (state_of(from, state, &sum) != SCATTER_LOST)
+		if (state_of(from, state, &sum) != SCATTER_LOST || (is_known(state, &sum) && sum.lost))
 			code = sums_put(to->sums, i, &sum, err);
 		else if (states != NULL && states[i] == SCATTER_NONE)
 			code = sums_put(to->sums, i, &never, err);

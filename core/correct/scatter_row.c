@@ -256,10 +256,11 @@ static void warn_of_spikes(const struct correction_job *job, const struct scatte
 	const size_t spikes = scatter_stack_spikes(images, &count, &first);
 
 	if (spikes > 0)
-		warning_tell(job->warnings, "scatter_spikes",
-			     "%zu pixels in %d images of scatter, the first of them projection %d's, are negative or "
-			     "stand out from those about them, and were replaced from these",
-			     spikes, count, first);
+		warning_tell(
+		    job->warnings, "scatter_spikes",
+		    "negative, or unlike those about them, and replaced from these: %zu pixel%s in %d image%s of "
+		    "scatter, the first of them projection %d's",
+		    spikes, spikes == 1 ? "" : "s", count, count == 1 ? "" : "s", first);
 }
 
 /* The gantry's angle at a projection that has an image; NaN where the reconstruction does not have it. */

@@ -130,15 +130,16 @@ static void add_scan_warnings(cJSON *document, const struct scan *scan, const st
 		    "for PUT /v1/scans/{scan}/flat");
 	if (facts->complete && facts->scatter.wanted > 0) {
 		snprintf(detail, sizeof(detail),
-			 "%d of %d images of scatter are missing: the scan's jobs wait for PUT "
+			 "%d of %d images of scatter %s missing: the scan's jobs wait for PUT "
 			 "/v1/scans/{scan}/scatter/{k}",
-			 facts->scatter.wanted, facts->scatter.count);
+			 facts->scatter.wanted, facts->scatter.count, facts->scatter.wanted == 1 ? "is" : "are");
 		add_warning(warnings, "no_scatter", detail);
 	}
 	if (facts->scatter.lost > 0) {
 		snprintf(detail, sizeof(detail),
-			 "the disk has damaged %d images of scatter: the scan's jobs wait until they are sent again",
-			 facts->scatter.lost);
+			 "the disk has damaged %d image%s of scatter: the scan's jobs wait until %s sent again",
+			 facts->scatter.lost, facts->scatter.lost == 1 ? "" : "s",
+			 facts->scatter.lost == 1 ? "it is" : "they are");
 		add_warning(warnings, "damaged_image", detail);
 	}
 	if (facts->damaged)

@@ -37,6 +37,7 @@ struct stored_scan *stored_scan_free(struct stored_scan *scan)
 	free(scan->lost);
 	free(scan->scatter_progress);
 	free(scan->scatter_lost);
+	free(scan->scatter_other);
 	free(scan->sums);
 	watch_list_destroy(&scan->watchers);
 	pthread_mutex_destroy(&scan->lock);

@@ -48,10 +48,12 @@ struct stored_scan {
 	enum progress image[IMAGE_COUNT];
 	uint8_t image_sha256[IMAGE_COUNT][32];
 	bool image_lost[IMAGE_COUNT]; /* as of projections */
-	/* Constant: images of scatter that the scan announces. The next two are [scatter_count], as of projections. */
+	/* Constant: images of scatter that the scan announces. The next three are [scatter_count], two as of
+	 * projections. */
 	struct scatter_images scatter;
 	int scatter_count;
 	unsigned char *scatter_progress, *scatter_lost;
+	unsigned *scatter_other;       /* as scatter_file_states tells it: a part of the scan's basis */
 	pthread_mutex_t scatter_files; /* held over each writing to the files of those images, and over their mend */
 	bool document_damaged;         /* scan.json */
 	bool suspect;                  /* all of its files are to be checked before it is used (store/sums.c) */

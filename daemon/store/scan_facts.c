@@ -1,4 +1,5 @@
 /* Facts of a scan that are in memory: store.h. */
+#include <limits.h>
 #include <stdio.h>
 #include <string.h>
 
@@ -50,7 +51,8 @@ static bool is_convertible(const struct stored_scan *scan)
 
 /*
  * Which images are there, and whether the scan has ended, is all that its projections are understood by. An image that
- * was lost or removed may come again as another.
+ * was lost or removed may come again as another. Images of scatter come one by one while a job has begun with others;
+ * one counts where it may be another than one that was there.
  */
 static unsigned basis_of(const struct stored_scan *scan)
 {
@@ -65,7 +67,11 @@ static unsigned basis_of(const struct stored_scan *scan)
 		if (scan->image[i] == STORED || scan->image_lost[i])
 			basis ^= (unsigned)(scan->image_sha256[i][0] << 8 | scan->image_sha256[i][1] << 16) << i;
 	}
-	return basis;
+	for (int i = 0; i < scan->scatter_count; i++) {
+		if (scan->scatter_other[i] != 0)
+			basis = (basis ^ scan->scatter_other[i]) * 16777619u + (unsigned)i;
+	}
+	return basis & INT_MAX; /* as the catalogue keeps it */
 }
 
 void stored_scan_add(struct stored_scan *scan, int index, const struct sum *sum)

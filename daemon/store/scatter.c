@@ -33,7 +33,8 @@ int stored_scan_set_scatter(struct stored_scan *scan, const struct scatter_image
 		return 0;
 	scan->scatter_progress = calloc((size_t)scan->scatter_count, 1);
 	scan->scatter_lost = calloc((size_t)scan->scatter_count, 1);
-	if (scan->scatter_progress == NULL || scan->scatter_lost == NULL)
+	scan->scatter_other = calloc((size_t)scan->scatter_count, sizeof(*scan->scatter_other));
+	if (scan->scatter_progress == NULL || scan->scatter_lost == NULL || scan->scatter_other == NULL)
 		return error_set_errno(err, ENOMEM, "list of %d images", scan->scatter_count);
 	return 0;
 }
@@ -88,7 +89,7 @@ void stored_scan_received_scatter(struct stored_scan *scan, unsigned char *ret_f
 
 /* In memory what the records say; an image that somebody is writing just now is left to them. Returns how many that
  * were stored are not any more. */
-static int follow_records(struct stored_scan *scan, const unsigned char *states)
+static int follow_records(struct stored_scan *scan, const unsigned char *states, const unsigned *others)
 {
 	int lost = 0;
 
@@ -99,13 +100,14 @@ static int follow_records(struct stored_scan *scan, const unsigned char *states)
 		lost += scan->scatter_progress[i] == STORED && states[i] != SCATTER_STORED;
 		scan->scatter_progress[i] = states[i] == SCATTER_STORED ? STORED : MISSING;
 		scan->scatter_lost[i] = states[i] == SCATTER_LOST;
+		scan->scatter_other[i] = others[i];
 	}
 	scan->losses += (unsigned)lost;
 	pthread_mutex_unlock(&scan->lock);
 	return lost;
 }
 
-static int read_states(struct stored_scan *scan, unsigned char *ret_states, struct error *err)
+static int read_states(struct stored_scan *scan, unsigned char *ret_states, unsigned *ret_others, struct error *err)
 {
 	struct scatter_file file;
 	bool whole;
@@ -114,7 +116,7 @@ static int read_states(struct stored_scan *scan, unsigned char *ret_states, stru
 	if (code != 0)
 		return code;
 	code = file.sums < 0 ? error_set(err, ERR_DAMAGED, "there is no " SUMS_SCATTER_FILE)
-			     : scatter_file_states(&file, ret_states, err);
+			     : scatter_file_states(&file, ret_states, ret_others, err);
 	scatter_file_close(&file);
 	return code;
 }
@@ -133,22 +135,23 @@ static void known_states(struct stored_scan *scan, unsigned char *ret_states)
  * not. */
 static int mend(struct stored_scan *scan, bool known, bool *ret_mended, struct error *err)
 {
-	unsigned char *states = malloc((size_t)scan->scatter_count);
+	unsigned *others = malloc((size_t)scan->scatter_count * (sizeof(*others) + 1));
+	unsigned char *states = (unsigned char *)(others + scan->scatter_count);
 	char directory[1024];
 	int code, lost = 0;
 
-	if (states == NULL)
+	if (others == NULL)
 		return error_set_errno(err, ENOMEM, "list of %d images", scan->scatter_count);
 	store_scan_directory(scan->store, scan->id, directory);
 	pthread_mutex_lock(&scan->scatter_files);
 	known_states(scan, states);
 	code = scatter_file_mend(directory, &scan->scatter, scan->count, known ? states : NULL, ret_mended, err);
 	if (code == 0)
-		code = read_states(scan, states, err);
+		code = read_states(scan, states, others, err);
 	if (code == 0)
-		lost = follow_records(scan, states);
+		lost = follow_records(scan, states, others);
 	pthread_mutex_unlock(&scan->scatter_files);
-	free(states);
+	free(others);
 	if (*ret_mended)
 		log_line(LEVEL_ERROR,
 			 "scan %s: its images of scatter are not all there with their checksums: what is damaged is "
@@ -391,7 +394,23 @@ static int check_room(struct stored_scan *scan, int image, struct error *err)
 	return code;
 }
 
-/* A code that are_not_whole knows: nothing is written. */
+/* Who has begun with another image finds the scan's basis changed before it can read this one. */
+static int write_in_place(struct stored_scan *scan, const struct scatter_file *file, int image, const float *pixels,
+			  struct error *err)
+{
+	struct sum sum;
+	unsigned other;
+	int code = scatter_file_describe(file, image, pixels, &sum, &other, err);
+
+	if (code != 0)
+		return code;
+	pthread_mutex_lock(&scan->lock);
+	scan->scatter_other[image] = other;
+	pthread_mutex_unlock(&scan->lock);
+	return scatter_file_write(file, image, pixels, &sum, err);
+}
+
+/* A code that are_not_whole knows, or ERR_CONFLICT: nothing is written. */
 static int write_image(struct stored_scan *scan, int image, const float *pixels, struct error *err)
 {
 	struct scatter_file file;
@@ -402,7 +421,7 @@ static int write_image(struct stored_scan *scan, int image, const float *pixels,
 	code = open_file(scan, true, &file, &whole, err);
 	if (code == 0) {
 		code = file.sums < 0 || !whole ? error_set(err, ERR_NOT_FOUND, SUMS_SCATTER_FILE " is not whole")
-					       : scatter_file_write(&file, image, pixels, err);
+					       : write_in_place(scan, &file, image, pixels, err);
 		scatter_file_close(&file);
 	}
 	pthread_mutex_unlock(&scan->scatter_files);
@@ -421,7 +440,7 @@ static int write_claimed(struct stored_scan *scan, int image, const float *pixel
 		if (code == 0)
 			code = write_image(scan, image, pixels, err);
 	}
-	if (code != 0)
+	if (code != 0 && code != ERR_CONFLICT)
 		store_distrust(scan->store, err);
 	return code;
 }
@@ -520,9 +539,10 @@ int store_remove_scatter(struct stored_scan *scan, int image, struct error *err)
 	for (int i = 0; i < scan->scatter_count; i++) {
 		if (!flags[i])
 			continue;
-		/* What could not be removed is lost: the next who sends one puts it in its place. */
+		/* What could not be removed is lost, and may be removed again. */
 		scan->scatter_progress[i] = MISSING;
 		scan->scatter_lost[i] = code != 0;
+		scan->scatter_other[i] = 0;
 	}
 	scan->losses++; /* who has begun with it begins anew */
 	pthread_mutex_unlock(&scan->lock);
