@@ -16,6 +16,11 @@ enum { HALVES = 2, VIEWS_LEAST = 64, BINS_LEAST = 24, MEASURED_LEAST = 24 };
 static const double ARC_LEAST = 2.8; /* radians; a shorter arc's volume is too far from the object */
 /* Bins at the isocentre, and sigmas, from which on the geometry is doubtful; bins from which on it is wrong. */
 static const double DOUBTFUL = 0.09, BEYOND_SIGMA = 2, WRONG = 0.15;
+/*
+ * Bins below which nothing is said where truncation or half of a displaced detector's views make as much: what is
+ * beyond the detector leaves short scans of exact circles .34 bins aside, small balls beside the axis up to .11.
+ */
+static const double CUT_SHORT = 0.5, DISPLACED = 0.15;
 /* The unexplained share from which on the geometry is wrong: what fits stays below .3, truncated and noisy or not. */
 static const double UNEXPLAINED = 0.4;
 
@@ -344,6 +349,8 @@ int agreement_measure(const struct reduced *reduced, const struct cancel *cancel
 	if (code == 0) {
 		summarise(&agreement, reduced);
 		agreement.cut = is_cut(reduced);
+		agreement.short_scan = half.orbit.short_scan;
+		agreement.displaced = half.orbit.displaced;
 	}
 	half_clear(&half);
 	free(made);
@@ -365,14 +372,16 @@ enum agreement_grade agreement_grade(const struct agreement *agreement, double b
 {
 	/* mm^2 is the mean square without that of sigma. */
 	const double raw = hypot(agreement->mm, agreement->sigma_mm);
+	const double least = agreement->cut && agreement->short_scan ? CUT_SHORT
+			     : agreement->displaced                  ? DISPLACED
+								     : DOUBTFUL;
 
 	if (opposite_rays_other_way(&agreement->rays))
 		return AGREEMENT_OTHER_WAY;
 	if (opposite_rays_displaced(&agreement->rays) || opposite_rays_aside(&agreement->rays) ||
 	    (agreement_is_known(agreement) && agreement->unexplained > UNEXPLAINED && !agreement->cut))
 		return AGREEMENT_WRONG;
-	if (!agreement_is_known(agreement) || agreement->mm < DOUBTFUL * bin ||
-	    raw < BEYOND_SIGMA * agreement->sigma_mm)
+	if (!agreement_is_known(agreement) || agreement->mm < least * bin || raw < BEYOND_SIGMA * agreement->sigma_mm)
 		return AGREEMENT_GOOD;
 	return agreement->mm < WRONG * bin ? AGREEMENT_DOUBTFUL : AGREEMENT_WRONG;
 }

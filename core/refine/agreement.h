@@ -45,7 +45,9 @@ struct agreement {
 	double unexplained; /* median of the views' shares */
 	int worst;          /* number of the view, in the scan, that lies aside most */
 	double worst_mm;
-	bool cut; /* the object is wider than the detector: nothing follows from what is unexplained */
+	bool cut;        /* the object is wider than the detector: nothing follows from what is unexplained */
+	bool short_scan; /* of the orbit; both raise what is told of a geometry that lies aside */
+	bool displaced;  /* the detector: half of the views see each outer ray */
 	struct opposite_rays rays;
 	struct view_agreement *views; /* [reduced.geometry.count], owned */
 };

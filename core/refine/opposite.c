@@ -15,6 +15,14 @@ static const double FAR_ASIDE = 3;
 static const double SMALLER = 4, NEARLY = 2, FAR_SMALLER = 8;
 /* The share of the integrals below which differences come from the bins' width, and say nothing. */
 static const double SHARE_LEAST = 0.005;
+/* Differences of integrals that have nothing to do with each other are twice their mean square. */
+static const double NOTHING_SHOWN = 2;
+/* Parts of the mean square of all that the rows show: from one on rays say something, below the other they are empty.
+ */
+static const double SHOWN = 0.1, EMPTY = 0.02;
+/* The most that is left, of the integrals' mean square, where a cause is named: what the bins' width leaves of small
+ * balls. */
+static const double EXPLAINED = 0.01;
 
 static void mirror(double v[3], const double across[3])
 {
@@ -64,16 +72,17 @@ static bool sample(const struct reduced *reduced, int view, double column, doubl
 	return true;
 }
 
-/* Mean squares where detectors stand aside by so many bins. */
+/* Mean squares where detectors stand aside by so many bins, and the bins between which the rays are. */
 struct comparison {
 	int pairs;
 	double difference, integral;
+	double from, to, row;
 };
 
 static struct comparison compare(const struct reduced *reduced, double (*matrices)[12], double aside)
 {
 	const struct geometry *geometry = &reduced->geometry;
-	struct comparison sums = {0};
+	struct comparison sums = {.from = geometry->columns, .to = 0};
 
 	for (int i = 0; i < geometry->count; i++)
 		for (int j = i + 1; j < geometry->count && reduced->known[i]; j++) {
@@ -89,25 +98,54 @@ static struct comparison compare(const struct reduced *reduced, double (*matrice
 				continue;
 			sums.difference += pow(value[0] - value[1], 2);
 			sums.integral += (pow(value[0], 2) + pow(value[1], 2)) / 2;
+			sums.from = fmin(sums.from, fmin(column[0], column[1]) + aside);
+			sums.to = fmax(sums.to, fmax(column[0], column[1]) + aside);
+			sums.row += (row[0] + row[1]) / 2;
 			sums.pairs++;
 		}
 	if (sums.pairs < PAIRS_LEAST)
 		return (struct comparison){0};
 	sums.difference /= sums.pairs;
 	sums.integral /= sums.pairs;
+	sums.row /= sums.pairs;
 	return sums;
 }
 
-static void compare_aside(const struct reduced *reduced, double (*matrices)[12], struct opposite_rays *rays)
+/* The mean square of what all views show on the row, between two columns. */
+static double shown(const struct reduced *reduced, double row, double from, double to)
+{
+	const int columns = reduced->geometry.columns, rows = reduced->geometry.rows;
+	double sum = 0;
+	int count = 0;
+
+	for (int k = 0; k < reduced->geometry.count; k++)
+		for (int c = (int)ceil(from); c <= (int)floor(to) && reduced->known[k]; c++, count++)
+			sum +=
+			    pow((double)reduced
+				    ->projections[((size_t)k * (size_t)rows + (size_t)lround(row)) * (size_t)columns +
+						  (size_t)c],
+				2);
+	return count > 0 ? sum / count : 0;
+}
+
+/* all: the mean square of what the row shows. */
+static double share_of(const struct comparison *found, double all)
+{
+	return found->pairs > 0 && found->integral > SHOWN * all ? found->difference / found->integral : NOTHING_SHOWN;
+}
+
+static void compare_aside(const struct reduced *reduced, double (*matrices)[12], double all, struct opposite_rays *rays)
 {
 	rays->least = rays->square[OPPOSITE_GIVEN];
+	rays->least_share = rays->share[OPPOSITE_GIVEN];
 	rays->aside = 0;
 	for (int i = -ASIDE_STEPS; i <= ASIDE_STEPS; i++) {
 		const struct comparison at = compare(reduced, matrices, i * ASIDE_STEP);
 
-		if (2 * at.pairs <= rays->pairs[OPPOSITE_GIVEN] || at.difference >= rays->least)
+		if (2 * at.pairs <= rays->pairs[OPPOSITE_GIVEN] || share_of(&at, all) >= rays->least_share)
 			continue;
 		rays->least = at.difference;
+		rays->least_share = share_of(&at, all);
 		rays->aside = i * ASIDE_STEP;
 	}
 }
@@ -117,6 +155,7 @@ int opposite_rays_compare(const struct reduced *reduced, const double axis[3], s
 {
 	const struct geometry *geometry = &reduced->geometry;
 	double(*matrices)[12] = malloc((size_t)geometry->count * sizeof(*matrices));
+	double all = 0;
 
 	if (matrices == NULL)
 		return error_set(err, ERR_NO_MEMORY, "no memory for the matrices of %d views", geometry->count);
@@ -132,26 +171,37 @@ int opposite_rays_compare(const struct reduced *reduced, const double axis[3], s
 		found = compare(reduced, matrices, 0);
 		ret_rays->pairs[which] = found.pairs;
 		ret_rays->square[which] = found.difference;
+		if (which == OPPOSITE_GIVEN && found.pairs > 0)
+			all = shown(reduced, found.row, 0, geometry->columns - 1);
+		ret_rays->share[which] = share_of(&found, all);
 		if (which != OPPOSITE_GIVEN)
 			continue;
-		ret_rays->noticed = found.difference > pow(SHARE_LEAST, 2) * found.integral;
-		compare_aside(reduced, matrices, ret_rays);
+		ret_rays->noticed = found.pairs > 0 && ret_rays->share[which] > pow(SHARE_LEAST, 2);
+		ret_rays->empty = found.pairs > 0 && shown(reduced, found.row, found.from, found.to) < EMPTY * all;
+		compare_aside(reduced, matrices, all, ret_rays);
 	}
 	free(matrices);
 	return 0;
 }
 
-/* True if the case is possible, and explains so many times more than the other one. */
+/* True if the case is possible, and leaves so many times less of what the rays show than the other one. */
 static bool is_better(const struct opposite_rays *rays, enum opposite_case which, enum opposite_case than, double times)
 {
 	return rays->noticed && 2 * rays->pairs[which] > rays->pairs[OPPOSITE_GIVEN] && rays->pairs[than] > 0 &&
-	       times * rays->square[which] < rays->square[than];
+	       times * rays->share[which] < rays->share[than];
+}
+
+/* Where the given geometry's rays show nothing they are no worse than others. */
+static bool is_given_shown(const struct opposite_rays *rays)
+{
+	return rays->share[OPPOSITE_GIVEN] < NOTHING_SHOWN;
 }
 
 bool opposite_rays_other_way(const struct opposite_rays *rays)
 {
 	for (int i = OPPOSITE_OTHER_WAY; i <= OPPOSITE_MIRRORED; i++)
-		if (is_better(rays, i, OPPOSITE_GIVEN, SMALLER) && NEARLY * rays->square[i] < rays->least &&
+		if (is_given_shown(rays) && is_better(rays, i, OPPOSITE_GIVEN, SMALLER) &&
+		    NEARLY * rays->share[i] < rays->least_share &&
 		    (rays->pairs[OPPOSITE_OTHER_SIDE] == 0 || is_better(rays, i, OPPOSITE_OTHER_SIDE, NEARLY)))
 			return true;
 	return false;
@@ -159,11 +209,19 @@ bool opposite_rays_other_way(const struct opposite_rays *rays)
 
 bool opposite_rays_displaced(const struct opposite_rays *rays)
 {
-	return is_better(rays, OPPOSITE_OTHER_SIDE, OPPOSITE_GIVEN, FAR_SMALLER);
+	const double share = rays->share[OPPOSITE_OTHER_SIDE];
+
+	if (!(share < EXPLAINED) || !(is_given_shown(rays) || rays->empty))
+		return false;
+	for (int i = OPPOSITE_OTHER_WAY; i <= OPPOSITE_MIRRORED; i++)
+		if (rays->pairs[i] > 0 && FAR_SMALLER * share >= rays->share[i])
+			return false;
+	return is_better(rays, OPPOSITE_OTHER_SIDE, OPPOSITE_GIVEN, FAR_SMALLER) &&
+	       FAR_SMALLER * share < rays->least_share;
 }
 
 bool opposite_rays_aside(const struct opposite_rays *rays)
 {
-	return rays->noticed && fabs(rays->aside) >= FAR_ASIDE &&
-	       FAR_SMALLER * rays->least < rays->square[OPPOSITE_GIVEN];
+	return rays->noticed && is_given_shown(rays) && fabs(rays->aside) >= FAR_ASIDE &&
+	       FAR_SMALLER * rays->least_share < rays->share[OPPOSITE_GIVEN];
 }

@@ -10,7 +10,9 @@
  * rays, and of a short scan only the views near its ends have.
  *
  * The mean square of the differences is taken for the geometry as it is, and for others that a scan's description is
- * mistaken for.
+ * mistaken for. Another one than the given geometry takes other columns to be those that two views share, with a
+ * displaced detector some that show air only, and air agrees with air: what counts is the difference as a share of the
+ * integrals, and only where these are no small part of what the rows show.
  */
 enum opposite_case {
 	OPPOSITE_GIVEN,
@@ -24,9 +26,16 @@ enum opposite_case {
 struct opposite_rays {
 	int pairs[OPPOSITE_CASES]; /* 0 where there are too few to say anything */
 	double square[OPPOSITE_CASES];
+	/* Of the mean square of the integrals; NOTHING_SHOWN where they are too small to say anything. */
+	double share[OPPOSITE_CASES];
+	/*
+	 * Where the geometry is the true one, the columns about the axis, that opposite views share, show of anything
+	 * in the field of view about as much as those beside them: if they are empty the geometry is not.
+	 */
+	bool empty;
 	bool noticed; /* the differences for the given geometry are large enough that another one may be looked for */
 	/* The least for detectors that all stand aside of the given geometry by the same, and bins by which they do. */
-	double least, aside;
+	double least, least_share, aside;
 };
 
 /* axis: the orbit's, a unit vector. ERR_NO_MEMORY is the only error. The same bits for any number of threads. */

@@ -301,6 +301,32 @@ START_TEST(a_displaced_detector_is_told_from_one_on_the_other_side)
 }
 END_TEST
 
+/* Air agrees with air, on the strip that would be shared were the detector on the other side: no reason to doubt. */
+START_TEST(a_ball_beside_the_axis_accuses_no_displaced_detector)
+{
+	const struct arm arm = arm_of(360);
+	const size_t pixels = (size_t)COLUMNS * ROWS;
+	struct ellipsoid ball = {
+	    .shape = SHAPE_ELLIPSOID, .semi_axes = {22, 22, 22}, .centre = {48, 22, 2}, .density = WATER};
+	float *projections = malloc(VIEWS * pixels * sizeof(*projections));
+	struct geometry taken = circle_of(&arm);
+	struct opposite_rays rays;
+
+	ck_assert_ptr_nonnull(projections);
+	for (int k = 0; k < VIEWS; k++) {
+		for (int a = 0; a < 3; a++)
+			taken.views[k].pixel0[a] += (_i ? -130 : 130) / PIXEL * taken.views[k].column_step[a];
+		phantom_project(&(struct phantom){.count = 1, .parts = &ball}, &taken, k,
+				projections + (size_t)k * pixels);
+	}
+	rays = rays_of(&taken, projections);
+	ck_assert(rays.pairs[OPPOSITE_GIVEN] > 0 && !opposite_rays_displaced(&rays));
+	ck_assert(!opposite_rays_other_way(&rays) && !opposite_rays_aside(&rays));
+	geometry_clear(&taken);
+	free(projections);
+}
+END_TEST
+
 /* A ball on the axis looks the same either way: nothing can be known, and nothing is said. */
 START_TEST(a_ball_on_the_axis_turns_either_way)
 {
@@ -556,6 +582,7 @@ Suite *agreement_suite(void)
 	tcase_add_loop_test(known, a_detector_that_stands_far_aside_is_told, 0, 3);
 	tcase_add_loop_test(known, an_arm_that_turned_the_other_way_is_told, 0, 2 * KINDS);
 	tcase_add_loop_test(known, a_displaced_detector_is_told_from_one_on_the_other_side, 0, 3);
+	tcase_add_loop_test(known, a_ball_beside_the_axis_accuses_no_displaced_detector, 0, 2);
 	tcase_add_test(known, a_ball_on_the_axis_turns_either_way);
 	tcase_add_loop_test(known, a_truncated_head_is_accused_of_no_more_than_is_wrong, 0,
 			    (int)(sizeof(cuts) / sizeof(cuts[0])));
