@@ -58,34 +58,11 @@ static void expect(const struct ring *ring, int place, int axis, float ret[SAMPL
 	}
 }
 
-/* The mean square of a[i + shift] - b[i] where both are known; INFINITY where that is less than half of the profile. */
-static double apart_by(const float *a, const float *b, int samples, double shift)
-{
-	const int whole = (int)floor(shift);
-	const float part = (float)(shift - whole);
-	double sum = 0;
-	int count = 0;
-
-	for (int i = 0; i < samples; i++) {
-		const int from = i + whole, to = part > 0 ? from + 1 : from;
-		float apart;
-
-		if (from < 0 || to >= samples)
-			continue;
-		apart = a[from] + part * (a[to] - a[from]) - b[i];
-		if (isnan(apart))
-			continue;
-		sum += (double)apart * (double)apart;
-		count++;
-	}
-	return 2 * count >= samples && count > 0 ? sum / count : INFINITY;
-}
-
 static double power_of(const float *profile, int samples)
 {
 	const float none[SAMPLES] = {0};
 
-	return apart_by(profile, none, samples, 0);
+	return profile_apart(profile, none, samples, 0, (samples + 1) / 2);
 }
 
 static bool ends_in_air(const float *profile, int samples)
@@ -109,7 +86,7 @@ static void look_at_pair(const struct ring *ring, int place, int axis, struct pa
 	to = ring_view(ring, place + 1)->along[axis];
 	samples = samples_of(to);
 	expect(ring, place, axis, expected);
-	ret->change = apart_by(to, expected, samples, 0);
+	ret->change = profile_apart(to, expected, samples, 0, (samples + 1) / 2);
 }
 
 /* The usual change of the pairs around a place. */
@@ -144,7 +121,8 @@ static void find_shift(const struct ring *ring, int place, int axis, struct pair
 		return;
 	expect(ring, place, axis, expected);
 	for (int s = -QUARTERS * samples / 4; s <= QUARTERS * samples / 4; s++) {
-		const double left = apart_by(to->along[axis], expected, samples, s / (double)QUARTERS);
+		const double left =
+		    profile_apart(to->along[axis], expected, samples, s / (double)QUARTERS, (samples + 1) / 2);
 
 		if (left < best) {
 			best = left;

@@ -5,6 +5,7 @@
 #include <stdlib.h>
 #include <string.h>
 
+#include "core/correct/ring.h"
 #include "core/error.h"
 #include "core/select.h"
 
@@ -123,28 +124,14 @@ static bool is_level(const struct between *at, float *ret_amount)
 	return agree >= MOST_BLOCKS * count;
 }
 
-/* The mean square of a[i + shift] - b[i] where both are known; INFINITY where that is less than half of the profile. */
+/* profile_apart; INFINITY where both know less than half of what b knows. */
 static double apart_by(const float *a, const float *b, double shift)
 {
-	const int whole = (int)floor(shift);
-	const float part = (float)(shift - whole);
-	double sum = 0;
-	int count = 0, known = 0;
+	int known = 0;
 
-	for (int i = 0; i < OUTLIERS_SAMPLES; i++) {
-		const int from = i + whole, to = part > 0 ? from + 1 : from;
-		float apart;
-
+	for (int i = 0; i < OUTLIERS_SAMPLES; i++)
 		known += !isnan(b[i]);
-		if (from < 0 || to >= OUTLIERS_SAMPLES)
-			continue;
-		apart = a[from] + part * (a[to] - a[from]) - b[i];
-		if (isnan(apart))
-			continue;
-		sum += (double)apart * (double)apart;
-		count++;
-	}
-	return count > 0 && 2 * count >= known ? sum / count : INFINITY;
+	return profile_apart(a, b, OUTLIERS_SAMPLES, shift, (known + 1) / 2);
 }
 
 /* The mean square between the profiles of two views along the rows. */
@@ -213,32 +200,12 @@ static bool is_outlier(const struct between *at, enum outlier_kind kind, float *
 
 /* ---- the views along the orbit ---- */
 
-struct place {
-	double angle; /* radians from the first view of the arc on, in the direction of the rotation */
-	int view;
-};
-
-struct ring {
-	const struct view_profile *views;
-	struct place *places; /* [count], by angle */
-	int count, all;       /* all: views of the scan */
-	bool closed;
-};
-
-static int compare_places(const void *a, const void *b)
-{
-	const struct place *x = a, *y = b;
-
-	return x->angle != y->angle ? (x->angle > y->angle) - (x->angle < y->angle)
-				    : (x->view > y->view) - (x->view < y->view);
-}
-
 /* The view at a place, counted on over the end of a closed ring; -1 beyond the end of an arc. */
 static int view_at(const struct ring *ring, int place)
 {
-	if (!ring->closed && (place < 0 || place >= ring->count))
-		return -1;
-	return ring->places[(place + ring->count) % ring->count].view;
+	const struct ring_place *at = ring_place(ring, place);
+
+	return at != NULL ? at->view : -1;
 }
 
 static double angle_at(const struct ring *ring, int place)
@@ -333,7 +300,7 @@ static bool is_even(const struct view_profile *view)
 }
 
 /* Marks views that have the very values of the one before; in a scan whose views all look alike there is none. */
-static int mark_frozen(const struct ring *ring, struct outlier *ret_outliers, struct error *err)
+static int mark_frozen(const struct ring *ring, int views, struct outlier *ret_outliers, struct error *err)
 {
 	const float none[OUTLIERS_SAMPLES] = {0};
 	float *apart = malloc((size_t)ring->count * sizeof(*apart)),
@@ -357,7 +324,7 @@ static int mark_frozen(const struct ring *ring, struct outlier *ret_outliers, st
 	}
 	if (code == 0 && count > 0 &&
 	    select_median(apart, count) <= ROUNDING * ROUNDING * select_median(shown, count)) {
-		memset(ret_outliers, 0, (size_t)ring->all * sizeof(*ret_outliers));
+		memset(ret_outliers, 0, (size_t)views * sizeof(*ret_outliers));
 		found = 0;
 	}
 	free(apart);
@@ -380,27 +347,19 @@ static int mark_runs(const struct ring *ring, bool at_end, int run, enum outlier
 int outliers_find(const struct view_profile *views, const bool *skip, const struct orbit *orbit,
 		  struct outlier *ret_outliers, struct error *err)
 {
-	struct ring ring = {.views = views, .all = orbit->count, .closed = !orbit->short_scan};
-	int found, code;
+	struct ring ring;
+	int found, code = ring_open(&ring, views, skip, orbit, err);
 
+	if (code != 0)
+		return code;
 	memset(ret_outliers, 0, (size_t)orbit->count * sizeof(*ret_outliers));
-	ring.places = malloc((size_t)orbit->count * sizeof(*ring.places));
-	if (ring.places == NULL)
-		return error_set(err, ERR_NO_MEMORY, "no memory for the order of %d views", orbit->count);
-	for (int i = 0; i < orbit->count; i++) {
-		const double turn = (orbit->angle[i] - orbit->angle[orbit->first]) * orbit->direction;
-
-		if (!skip[i])
-			ring.places[ring.count++] = (struct place){turn < 0 ? turn + 2 * PI : turn, i};
-	}
-	qsort(ring.places, (size_t)ring.count, sizeof(*ring.places), compare_places);
-	code = ring.count >= VIEWS_LEAST ? mark_frozen(&ring, ret_outliers, err) : 0;
+	code = ring.count >= VIEWS_LEAST ? mark_frozen(&ring, orbit->count, ret_outliers, err) : 0;
 	found = code;
 	for (int at_end = 0; at_end < 2 && code >= 0 && ring.count >= VIEWS_LEAST; at_end++)
 		for (int run = 1; run <= OUTLIERS_RUN; run++)
 			for (int kind = OUTLIER_DARK; kind <= OUTLIER_SHIFTED; kind++)
 				found += mark_runs(&ring, at_end, run, (enum outlier_kind)kind, ret_outliers);
-	free(ring.places);
+	ring_clear(&ring);
 	if (code < 0)
 		return code;
 	return MOST * found <= ring.count ? found : 0;

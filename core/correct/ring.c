@@ -69,6 +69,28 @@ bool ring_is_near(const struct ring *ring, int place)
 	       ring_turn(ring, place, place + 1) <= NEAR * PI / 180;
 }
 
+double profile_apart(const float *a, const float *b, int samples, double shift, int least)
+{
+	const int whole = (int)floor(shift);
+	const float part = (float)(shift - whole);
+	double sum = 0;
+	int count = 0;
+
+	for (int i = 0; i < samples; i++) {
+		const int from = i + whole, to = part > 0 ? from + 1 : from;
+		float apart;
+
+		if (from < 0 || to >= samples)
+			continue;
+		apart = a[from] + part * (a[to] - a[from]) - b[i];
+		if (isnan(apart))
+			continue;
+		sum += (double)apart * (double)apart;
+		count++;
+	}
+	return count > 0 && count >= least ? sum / count : INFINITY;
+}
+
 static int direction_of(float step)
 {
 	return (step > 0) - (step < 0); /* NAN is neither */

@@ -28,6 +28,12 @@ double ring_turn(const struct ring *ring, int from, int to);
 bool ring_is_near(const struct ring *ring, int place);
 
 /*
+ * The mean square of a[i + shift] - b[i], between samples of a linearly, where both are known; INFINITY where that are
+ * fewer than `least`. a, b: [samples].
+ */
+double profile_apart(const float *a, const float *b, int samples, double shift, int least);
+
+/*
  * steps: [count], what steps from a place to the next, by one size up or down; 0: nothing, NAN: it may. They are added
  * up along the ring, and what most views have is right. Calls `mark` for each run of views that have one step more or
  * less: the place before it and its last one, both from 0 to count - 1; returns the sum of what that returns.

@@ -410,18 +410,29 @@ static int write_in_place(struct stored_scan *scan, const struct scatter_file *f
 	return scatter_file_write(file, image, pixels, &sum, err);
 }
 
+/* For writing, with scan->scatter_files locked; a code that are_not_whole knows where they are not. */
+static int open_whole(struct stored_scan *scan, struct scatter_file *ret_file, struct error *err)
+{
+	bool whole;
+	int code = open_file(scan, true, ret_file, &whole, err);
+
+	if (code == 0 && (ret_file->sums < 0 || !whole)) {
+		scatter_file_close(ret_file);
+		return error_set(err, ERR_NOT_FOUND, SUMS_SCATTER_FILE " is not whole");
+	}
+	return code;
+}
+
 /* A code that are_not_whole knows, or ERR_CONFLICT: nothing is written. */
 static int write_image(struct stored_scan *scan, int image, const float *pixels, struct error *err)
 {
 	struct scatter_file file;
-	bool whole;
 	int code;
 
 	pthread_mutex_lock(&scan->scatter_files);
-	code = open_file(scan, true, &file, &whole, err);
+	code = open_whole(scan, &file, err);
 	if (code == 0) {
-		code = file.sums < 0 || !whole ? error_set(err, ERR_NOT_FOUND, SUMS_SCATTER_FILE " is not whole")
-					       : write_in_place(scan, &file, image, pixels, err);
+		code = write_in_place(scan, &file, image, pixels, err);
 		scatter_file_close(&file);
 	}
 	pthread_mutex_unlock(&scan->scatter_files);
@@ -505,14 +516,12 @@ static int claim_removal(struct stored_scan *scan, int image, unsigned char *ret
 static int forget(struct stored_scan *scan, const unsigned char *flags, struct error *err)
 {
 	struct scatter_file file;
-	bool whole;
 	int code;
 
 	pthread_mutex_lock(&scan->scatter_files);
-	code = open_file(scan, true, &file, &whole, err);
+	code = open_whole(scan, &file, err);
 	if (code == 0) {
-		code = file.sums < 0 || !whole ? error_set(err, ERR_NOT_FOUND, SUMS_SCATTER_FILE " is not whole")
-					       : scatter_file_forget(&file, flags, err);
+		code = scatter_file_forget(&file, flags, err);
 		scatter_file_close(&file);
 	}
 	pthread_mutex_unlock(&scan->scatter_files);
