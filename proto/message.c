@@ -62,6 +62,7 @@ static const struct field hello_fields[] = {
     FIELD("backend", FIELD_STRING, backend),          FIELD("device", FIELD_STRING, info.name),
     FIELD("driver", FIELD_STRING, info.driver),       FIELD("bytes_total", FIELD_SIZE, info.bytes_total),
     FIELD("bytes_free", FIELD_SIZE, info.bytes_free), {0}};
+static const struct field refused_fields[] = {FIELD("text", FIELD_STRING, text), {0}};
 static const struct field alive_fields[] = {
     FIELD("steps", FIELD_SIZE, steps), FIELD("step_seconds", FIELD_NUMBER, step_seconds), {0}};
 static const struct field opened_fields[] = {FIELD("job", FIELD_STRING, job),
@@ -143,6 +144,7 @@ static const struct {
     [MESSAGE_YIELD] = {"yield", job_fields},
     [MESSAGE_QUIT] = {"quit", no_fields},
     [MESSAGE_HELLO] = {"hello", hello_fields},
+    [MESSAGE_REFUSED] = {"refused", refused_fields},
     [MESSAGE_ALIVE] = {"alive", alive_fields},
     [MESSAGE_OPENED] = {"opened", opened_fields},
     [MESSAGE_RECONSTRUCTED] = {"reconstructed", reconstructed_fields},

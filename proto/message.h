@@ -28,7 +28,8 @@ enum message_kind {
 	MESSAGE_YIELD,
 	MESSAGE_QUIT, /* finish or yield what runs, then exit 0 */
 	/* worker -> daemon */
-	MESSAGE_HELLO, /* backend, device, driver, bytes_total, bytes_free */
+	MESSAGE_HELLO,   /* backend, device, driver, bytes_total, bytes_free */
+	MESSAGE_REFUSED, /* in its place, of a place on another host: text, why nothing can be done there */
 	/*
 	 * steps: that it has finished since its start, whatever they were of; step_seconds: that the one under way may
 	 * take by its nature, 0: as any other. Every second (proto/heartbeat.h), also without a job.

@@ -254,6 +254,9 @@ int document_print(const cJSON *document, struct error *err)
 static int status_error(int status)
 {
 	switch (status) {
+	case 401:
+	case 403:
+		return ERR_DENIED;
 	case 404:
 		return ERR_NOT_FOUND;
 	case 409:

@@ -14,6 +14,9 @@
  */
 struct http;
 
+/* 401 and 403: the daemon does not know who asks, or another role is wanted. */
+enum { ERR_DENIED = -65 };
+
 /* The options of every subcommand that talks to a daemon. */
 struct http_options {
 	const char *url; /* "http://HOST:PORT" or "unix:PATH"; NULL: $CBCT_URL, else http://127.0.0.1:2228 */

@@ -74,6 +74,9 @@ int remote_judge(struct remote *remote, int code, struct error *err)
 	/* Removed there, by an operator or because the claim is another host's now. */
 	if (code == ERR_NOT_FOUND)
 		return error_set(err, ERR_BUSY, "it is gone on %.60s: %.200s", remote->options->host, err->text);
+	/* The token was revoked, or has expired, meanwhile: no fault of the job. */
+	if (code == ERR_DENIED)
+		return error_set(err, ERR_BUSY, "%.60s refuses this host: %.200s", remote->options->host, err->text);
 	/* Another host may have it, and this one other jobs. */
 	if (code == ERR_NO_SPACE)
 		return error_set(err, ERR_BUSY, "%.60s has no room: %.200s", remote->options->host, err->text);
@@ -284,13 +287,38 @@ static int serve_job(struct remote *remote, const struct message *start, struct 
 
 /* ---- the start ---- */
 
+/* Scans and jobs can be posted there: asked before a job begins on the way there. */
+static int check_role(struct remote *remote, struct error *err)
+{
+	cJSON *session = NULL;
+	int code = http_json(remote->http, "GET", "/v1/session", &session, err);
+
+	if (code == 0 && strcmp(member_text(session, "role", ""), "view") == 0)
+		code = error_set(err, ERR_DENIED, "the token shown has the role view, and acquire is wanted");
+	cJSON_Delete(session);
+	return code;
+}
+
+/* The daemon here tells that, and this process ends. */
+static int say_refused(const struct remote_options *options, int code, const struct error *why, struct error *err)
+{
+	struct message refused = {.kind = MESSAGE_REFUSED};
+
+	snprintf(refused.text, sizeof(refused.text), "%s%.300s", code == ERR_DENIED ? "it refuses this host: " : "",
+		 why->text);
+	return message_send((int)options->socket, &refused, err);
+}
+
 /* The first device there, as the daemon here shows it. */
 static int say_hello(struct remote *remote, struct error *err)
 {
 	struct message hello = {.kind = MESSAGE_HELLO};
 	cJSON *document = NULL;
 	const cJSON *device;
-	int code = http_json(remote->http, "GET", "/v1/devices", &document, err);
+	int code = check_role(remote, err);
+
+	if (code == 0)
+		code = http_json(remote->http, "GET", "/v1/devices", &document, err);
 
 	device = cJSON_GetArrayItem(cJSON_GetObjectItemCaseSensitive(document, "devices"), 0);
 	snprintf(hello.backend, sizeof(hello.backend), "%s", member_text(device, "backend", ""));
@@ -327,6 +355,7 @@ static int remote_run(const void *values, struct error *err)
 	const struct remote_options *options = values;
 	struct remote *remote = calloc(1, sizeof(*remote));
 	struct heartbeat *heartbeat = NULL;
+	struct error why;
 	int code;
 
 	if (remote == NULL)
@@ -335,14 +364,17 @@ static int remote_run(const void *values, struct error *err)
 	prctl(PR_SET_PDEATHSIG, SIGKILL);
 	remote->options = options;
 	remote->files.projections = remote->files.sums = -1;
-	code = http_new(&options->http, &remote->http, err);
+	code = http_new(&options->http, &remote->http, &why);
 	if (code == 0)
-		code = say_hello(remote, err);
-	if (code == 0)
+		code = say_hello(remote, &why);
+	if (code != 0) {
+		code = say_refused(options, code, &why, err);
+	} else {
 		code = heartbeat_start((int)options->socket, &heartbeat, err);
-	if (code == 0)
-		code = serve(remote, err);
-	heartbeat_stop(heartbeat);
+		if (code == 0)
+			code = serve(remote, err);
+		heartbeat_stop(heartbeat);
+	}
 	http_free(remote->http);
 	free(remote);
 	return code;

@@ -313,9 +313,11 @@ static void add_views(cJSON *document, const struct scan_facts *scan, const stru
 
 /* Adds the names of all that a job waits for before it can begin; an empty list for any other job. */
 static void add_waiting_for(cJSON *document, const struct scan_facts *scan, const struct job_record *record,
-			    enum job_obstacle obstacle)
+			    struct job *job)
 {
+	const enum job_obstacle obstacle = job_obstacle(job);
 	cJSON *list = cJSON_AddArrayToObject(document, "waiting_for");
+	char text[JOB_WAIT_SIZE];
 
 	if (record->state == JOB_WAITING && scan != NULL) {
 		if (lacks_flat(scan))
@@ -335,6 +337,10 @@ static void add_waiting_for(cJSON *document, const struct scan_facts *scan, cons
 		cJSON_AddItemToArray(list, cJSON_CreateString(job_obstacle_names[obstacle]));
 	else if (record->state == JOB_QUEUED)
 		cJSON_AddItemToArray(list, cJSON_CreateString("worker"));
+	job_wait_text(job, text);
+	if (text[0] != '\0' && obstacle != JOB_NO_HOST)
+		cJSON_AddItemToArray(list, cJSON_CreateString(job_obstacle_names[JOB_NO_HOST]));
+	add_text_or_null(document, "waiting_detail", text);
 }
 
 /* The numbers of the devices in GET /v1/devices. */
@@ -365,7 +371,7 @@ static void add_job_facts(cJSON *document, struct job *job, const struct job_rec
 	cJSON_AddNumberToObject(document, "iteration", record->iteration);
 	cJSON_AddNumberToObject(document, "iterations", record->iterations);
 	cJSON_AddNumberToObject(document, "progress", record->fraction);
-	add_waiting_for(document, scan, record, job_obstacle(job));
+	add_waiting_for(document, scan, record, job);
 	add_views(document, scan, record);
 	add_number_or_null(document, "eta_s", job_eta(job));
 	add_number_or_null(document, "start_s", job_start_in(job));

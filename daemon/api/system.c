@@ -22,11 +22,24 @@ int live_get(void *context, struct request *request, struct error *err)
 	return reply_word(request, "alive, " CBCTD_PROGRAM "\n", err);
 }
 
+/* Hosts of the fleet that cannot be given jobs, a line each after `begin`; "" where there are none. */
+static void write_troubles(const struct api *api, const char *begin, char *ret_text, size_t size)
+{
+	struct host_trouble troubles[TROUBLES_MAX];
+	const int count = supervise_troubles(api->supervise, troubles);
+	size_t length = 0;
+
+	ret_text[0] = '\0';
+	for (int i = 0; i < count && length + 1 < size; i++)
+		length += (size_t)snprintf(ret_text + length, size - length, "%shost %s cannot be given jobs: %.120s\n",
+					   begin, troubles[i].host, troubles[i].text);
+}
+
 /* Ready all the same: what is set aside, and an audit log that has no room, hinder nobody, but somebody should look. */
 static int reply_ready(struct request *request, const struct api *api, struct error *err)
 {
 	struct quarantined *entries;
-	char text[1024], quarantine[100];
+	char text[2048], quarantine[100], fleet[1024];
 	int count;
 
 	if (quarantine_list(store_directory(api->store), &entries, &count, err) != 0)
@@ -36,8 +49,10 @@ static int reply_ready(struct request *request, const struct api *api, struct er
 		snprintf(quarantine, sizeof(quarantine), "%s", "");
 	else
 		snprintf(quarantine, sizeof(quarantine), "quarantine: %d set aside, see /v1/quarantine\n", count);
-	snprintf(text, sizeof(text), "ready\n%s%s", quarantine,
-		 http_audit_fails(api->http) ? "audit: it cannot be written, lines are lost, see the log\n" : "");
+	write_troubles(api, "fleet: ", fleet, sizeof(fleet));
+	snprintf(text, sizeof(text), "ready\n%s%s%s", quarantine,
+		 http_audit_fails(api->http) ? "audit: it cannot be written, lines are lost, see the log\n" : "",
+		 fleet);
 	return reply_word(request, text, err);
 }
 
@@ -45,11 +60,15 @@ int ready_get(void *context, struct request *request, struct error *err)
 {
 	struct api *api = context;
 	struct error why;
+	char fleet[220];
 
 	if (store_away(api->store))
 		return error_set(err, ERR_AWAY, "the catalogue's database cannot be reached, nothing can be stored");
-	if (!supervise_ready(api->supervise))
-		return error_set(err, ERR_BUSY, "no worker can take a job");
+	if (!supervise_ready(api->supervise)) {
+		write_troubles(api, "; ", fleet, sizeof(fleet));
+		fleet[strcspn(fleet, "\n")] = '\0';
+		return error_set(err, ERR_BUSY, "no worker can take a job%s", fleet);
+	}
 	if (store_check_directory(api->store, &why) != 0)
 		return error_set(err, ERR_BUSY, "the state directory is gone, nothing can be stored");
 	return reply_ready(request, api, err);

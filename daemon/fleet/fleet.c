@@ -193,6 +193,7 @@ int fleet_start(struct jobs *jobs, struct supervise *supervise, const struct fle
 		jobs_watch(jobs, &fleet->watch);
 		code = pthread_create(&fleet->thread, NULL, fleet_loop, fleet);
 		if (code == 0) {
+			jobs_set_explain(jobs, fleet_explain, fleet);
 			*ret_fleet = fleet;
 			return 0;
 		}
@@ -207,6 +208,7 @@ void fleet_stop(struct fleet *fleet)
 {
 	if (fleet == NULL)
 		return;
+	jobs_set_explain(fleet->jobs, NULL, NULL);
 	atomic_store(&fleet->stop, true);
 	fleet_wake(fleet);
 	pthread_join(fleet->thread, NULL);

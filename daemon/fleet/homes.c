@@ -76,6 +76,35 @@ bool homes_find(struct homes *homes, const char *id, struct fleet_host *ret_host
 	return found;
 }
 
+bool homes_named(struct homes *homes, const char *name, struct fleet_host *ret_host)
+{
+	bool found = false;
+
+	pthread_mutex_lock(&homes->lock);
+	for (int i = 0; i < homes->count && !found; i++) {
+		found = strcmp(homes->hosts[i].facts.name, name) == 0;
+		if (found)
+			*ret_host = homes->hosts[i].facts;
+	}
+	pthread_mutex_unlock(&homes->lock);
+	return found;
+}
+
+void homes_takers(struct homes *homes, const struct where *where, int *ret_takers, int *ret_fit)
+{
+	*ret_takers = *ret_fit = 0;
+	pthread_mutex_lock(&homes->lock);
+	for (int i = 0; i < homes->count; i++) {
+		const struct fleet_host *host = &homes->hosts[i].facts;
+
+		if (host->away || host->url[0] == '\0')
+			continue;
+		++*ret_takers;
+		*ret_fit += where_fits(where, host->name, host->memory, host->devices);
+	}
+	pthread_mutex_unlock(&homes->lock);
+}
+
 /* ---- what this host has ---- */
 
 static void add_own(struct homes *homes, const char *id)

@@ -8,7 +8,7 @@
  * Which other host of the fleet has which scan or job, as the ledger says: a request for one of them is passed on to
  * the daemon that has it. What is new on another host is known here within some two seconds.
  *
- * Threads: any for homes_find, the fleet's for the two that speak to the ledger.
+ * Threads: any for homes_find, homes_named and homes_takers, the fleet's for the two that speak to the ledger.
  */
 struct homes;
 
@@ -17,6 +17,11 @@ void homes_free(struct homes *homes); /* NULL is fine */
 
 /* The host that has the scan or job of that id; false: none that is known of. */
 bool homes_find(struct homes *homes, const char *id, struct fleet_host *ret_host);
+
+/* Whether another host has that name. */
+bool homes_named(struct homes *homes, const char *name, struct fleet_host *ret_host);
+/* Other hosts that were seen within a lease and take jobs; *ret_fit: those whose devices are as `where` wants them. */
+void homes_takers(struct homes *homes, const struct where *where, int *ret_takers, int *ret_fit);
 
 /* The others are told what this host has, where that has changed. What it computes for others is theirs. */
 int homes_tell(struct homes *homes, struct jobs *jobs, struct ledger *ledger, struct error *err);

@@ -79,6 +79,10 @@ void fleet_clear_copies(struct fleet *fleet, bool all);
 /* Leases are renewed, and jobs of others claimed where devices are free. */
 int fleet_take(struct fleet *fleet, struct error *err);
 
+/* ---- explain.c ---- */
+/* jobs_explain; the context is the fleet. Any thread. */
+void fleet_explain(void *context, const struct where *where, bool elsewhere, char *ret_text, size_t size);
+
 /* ---- weigh.c ---- */
 /* What jobs want of this host's devices. */
 struct load {
@@ -87,6 +91,8 @@ struct load {
 };
 /* With `clean`, jobs of others that this host has no claim for any more are removed. */
 void fleet_weigh(struct fleet *fleet, bool clean, struct load *ret_load);
+/* Bytes of each device here that is given jobs, of those that have ever been there; returns how many. */
+int fleet_memory(struct fleet *fleet, double ret_memory[WHERE_DEVICES_MOST]);
 /* Devices here that get the first jobs of the queue; with `idle`, at once. */
 int fleet_devices(struct fleet *fleet, bool idle);
 

@@ -24,10 +24,8 @@ static int least_priority(const struct load *load, int devices, bool *ret_pushes
 int fleet_take(struct fleet *fleet, struct error *err)
 {
 	const int devices = fleet_devices(fleet, false);
-	struct worker_facts facts[PLACES_MAX + 65];
-	double memory[PLACES_MAX + 65];
-	const int memory_count = devices_memory(
-	    facts, supervise_workers(fleet->supervise, facts, (int)(sizeof(facts) / sizeof(facts[0]))), memory);
+	double memory[WHERE_DEVICES_MOST];
+	const int memory_count = fleet_memory(fleet, memory);
 	const bool due =
 	    clock_monotonic() >= fleet->renewed + (fleet->options.lease / 6 < LOOK ? fleet->options.lease / 6 : LOOK);
 	bool got = true, pushes;
@@ -35,7 +33,7 @@ int fleet_take(struct fleet *fleet, struct error *err)
 	int code = 0, least;
 
 	if (due) {
-		code = ledger_seen(fleet->ledger, err);
+		code = ledger_seen(fleet->ledger, memory, memory_count, err);
 		if (code == 0)
 			code = ledger_renew(fleet->ledger, fleet->claims, CLAIMS_MOST, &fleet->claim_count, err);
 		if (code != 0)

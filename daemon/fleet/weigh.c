@@ -18,6 +18,20 @@ int fleet_devices(struct fleet *fleet, bool idle)
 	return devices;
 }
 
+int fleet_memory(struct fleet *fleet, double ret_memory[WHERE_DEVICES_MOST])
+{
+	struct worker_facts facts[PLACES_MAX + 65];
+	double all[PLACES_MAX + 65];
+	int count = supervise_workers(fleet->supervise, facts, (int)(sizeof(facts) / sizeof(facts[0]))), there = 0;
+
+	count = devices_memory(facts, count, all);
+	for (int i = 0; i < count && there < WHERE_DEVICES_MOST; i++) {
+		if (all[i] > 0)
+			ret_memory[there++] = all[i];
+	}
+	return there;
+}
+
 static void claim_text(const struct fleet_claim *claim, char ret_text[160])
 {
 	place_claim(claim->owner, claim->job, claim->number, ret_text, 160);

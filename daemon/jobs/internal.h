@@ -92,7 +92,9 @@ struct jobs {
 	char host[WHERE_HOST_SIZE];
 	double device_bytes[WHERE_DEVICES_MOST];
 	int devices, devices_most;
-	double keep_devices; /* s */
+	double keep_devices;   /* s */
+	jobs_explain *explain; /* jobs_set_explain, with the next */
+	void *explain_context;
 };
 
 /* ---- jobs/offer.c ---- */

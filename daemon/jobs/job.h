@@ -239,6 +239,14 @@ int job_hold(struct job *job, enum job_obstacle obstacle, double until, unsigned
 /* Releases held jobs whose time has come and for which the disk has room; true while others are still held. */
 bool jobs_review_holds(struct jobs *jobs, double now, unsigned long long space);
 enum job_obstacle job_obstacle(struct job *job); /* any thread */
+/*
+ * Why a queued job has no host yet, one sentence, "" where it is not for want of one: `elsewhere`, no device here may
+ * run it. Called with the jobs' lock in hand. NULL: this host is in no fleet.
+ */
+typedef void jobs_explain(void *context, const struct where *where, bool elsewhere, char *ret_text, size_t size);
+void jobs_set_explain(struct jobs *jobs, jobs_explain *explain, void *context);
+enum { JOB_WAIT_SIZE = 320 };
+void job_wait_text(struct job *job, char ret_text[JOB_WAIT_SIZE]); /* any thread */
 struct job_trial *job_trial(struct job *job);
 /*
  * This host's name and the bytes that its devices have, of which each job's "where" says whether it may run here; until

@@ -53,6 +53,8 @@ static void hello(struct supervise *supervise, struct worker *worker, const stru
 	snprintf(worker->backend, sizeof(worker->backend), "%s", message->backend);
 	if (worker->aside && worker->testing)
 		device_clear(supervise, worker, "it has passed its self-test");
+	if (worker->remote)
+		remote_trouble(supervise, worker, NULL);
 	worker->mute = 0;
 	worker->deadline = NEVER;
 	worker->state = WORKER_IDLE;
@@ -153,6 +155,11 @@ static int on_message(struct supervise *supervise, struct worker *worker, const 
 	if (message->kind == MESSAGE_HELLO) {
 		if (worker->state == WORKER_STARTING)
 			hello(supervise, worker, message);
+		return 0;
+	}
+	if (message->kind == MESSAGE_REFUSED) {
+		if (worker->remote)
+			remote_trouble(supervise, worker, message->text);
 		return 0;
 	}
 	worker->signs.heard = clock_monotonic();

@@ -114,3 +114,27 @@ void jobs_set_devices(struct jobs *jobs, const char *host, const double *memory,
 		job_place(jobs->all[i]);
 	pthread_mutex_unlock(&jobs->lock);
 }
+
+void jobs_set_explain(struct jobs *jobs, jobs_explain *explain, void *context)
+{
+	pthread_mutex_lock(&jobs->lock);
+	jobs->explain = explain;
+	jobs->explain_context = context;
+	pthread_mutex_unlock(&jobs->lock);
+}
+
+void job_wait_text(struct job *job, char ret_text[JOB_WAIT_SIZE])
+{
+	struct jobs *jobs = job->jobs;
+	struct where where;
+
+	ret_text[0] = '\0';
+	pthread_mutex_lock(&jobs->lock);
+	where = job_request_where(&job->request);
+	if (job->record.state == JOB_QUEUED && jobs->explain != NULL)
+		jobs->explain(jobs->explain_context, &where, job->entry.elsewhere, ret_text, JOB_WAIT_SIZE);
+	else if (job->record.state == JOB_QUEUED && job->entry.elsewhere)
+		snprintf(ret_text, JOB_WAIT_SIZE,
+			 "this host, %.63s, may not run it by its \"where\", and is in no fleet", jobs->host);
+	pthread_mutex_unlock(&jobs->lock);
+}

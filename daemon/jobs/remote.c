@@ -14,7 +14,8 @@
 /* Runs that other hosts have given back, after which a job stays here: somewhere on that way is a fault of its own. */
 enum { GIVEN_BACK_MOST = 10 };
 
-static const double TIDY = 5; /* s that a process has behind its job to remove it from the other host */
+static const double TROUBLE_KEPT = 120; /* s: longer than a job that comes back stays with nobody */
+static const double TIDY = 5;           /* s that a process has behind its job to remove it from the other host */
 
 static const struct place *find_place(const struct place *places, int count, long long number)
 {
@@ -173,6 +174,38 @@ void remote_tend(struct supervise *supervise)
 	show_spent(supervise);
 }
 
+void remote_trouble(struct supervise *supervise, const struct worker *worker, const char *why)
+{
+	const double now = clock_monotonic();
+	struct host_trouble *trouble = &supervise->troubles[0];
+	bool told;
+
+	pthread_mutex_lock(&supervise->lock);
+	for (int i = 0; i < TROUBLES_MAX; i++) {
+		struct host_trouble *other = &supervise->troubles[i];
+
+		if (strcmp(other->host, worker->place.host) == 0) {
+			trouble = other;
+			break;
+		}
+		if (other->at < trouble->at)
+			trouble = other;
+	}
+	told = strcmp(trouble->host, worker->place.host) == 0 && now < trouble->at + TROUBLE_KEPT;
+	if (why == NULL && strcmp(trouble->host, worker->place.host) == 0)
+		*trouble = (struct host_trouble){.at = 0};
+	if (why != NULL) {
+		told &= strcmp(trouble->text, why) == 0;
+		snprintf(trouble->host, sizeof(trouble->host), "%s", worker->place.host);
+		snprintf(trouble->text, sizeof(trouble->text), "%.199s", why);
+		trouble->at = now;
+	}
+	pthread_mutex_unlock(&supervise->lock);
+	if (why != NULL && !told)
+		log_line(LEVEL_WARNING, "host %s of the fleet has claimed job %s and cannot be given it: %s",
+			 worker->place.host, worker->place.job, why);
+}
+
 bool remote_fits(const struct worker *worker, const struct job_trial *trial)
 {
 	return trial->place == worker->index && !worker->spent;
@@ -185,9 +218,11 @@ bool remote_fits(const struct worker *worker, const struct job_trial *trial)
 static enum worker_end end_failed(const struct worker *worker, struct job_trial *trial)
 {
 	const struct supervise *supervise = worker->supervise;
+	const bool here =
+	    *trial->devices <= supervise->regular &&
+	    where_fits(trial->where, supervise->options.remote.host, supervise->memory, supervise->memory_count);
 
-	if (!where_fits(trial->where, supervise->options.remote.host, supervise->memory, supervise->memory_count) &&
-	    ++trial->given_back >= GIVEN_BACK_MOST)
+	if (!here && ++trial->given_back >= GIVEN_BACK_MOST)
 		return END_OTHER;
 	job_stay(worker->job);
 	return END_MADE_ROOM;
@@ -238,6 +273,20 @@ int supervise_spent(struct supervise *supervise, struct place ret_places[PLACES_
 	pthread_mutex_lock(&supervise->lock);
 	count = supervise->spent_count;
 	memcpy(ret_places, supervise->spent, (size_t)count * sizeof(*ret_places));
+	pthread_mutex_unlock(&supervise->lock);
+	return count;
+}
+
+int supervise_troubles(struct supervise *supervise, struct host_trouble ret_troubles[TROUBLES_MAX])
+{
+	const double since = clock_monotonic() - TROUBLE_KEPT;
+	int count = 0;
+
+	pthread_mutex_lock(&supervise->lock);
+	for (int i = 0; i < TROUBLES_MAX; i++) {
+		if (supervise->troubles[i].at > 0 && supervise->troubles[i].at > since)
+			ret_troubles[count++] = supervise->troubles[i];
+	}
 	pthread_mutex_unlock(&supervise->lock);
 	return count;
 }

@@ -103,6 +103,17 @@ void supervise_set_places(struct supervise *supervise, const struct place *place
 /* Returns how many are spent. */
 int supervise_spent(struct supervise *supervise, struct place ret_places[PLACES_MAX]);
 
+/* Hosts that have claimed jobs of this one and cannot be given any: they refuse its token, or are not reached from
+ * here.
+ */
+struct host_trouble {
+	char host[64], text[200];
+	double at; /* monotonic: the last time; 0: none */
+};
+enum { TROUBLES_MAX = 16 };
+/* Returns how many there are: each host's last, of the last two minutes. */
+int supervise_troubles(struct supervise *supervise, struct host_trouble ret_troubles[TROUBLES_MAX]);
+
 /* A copy of what is known of one worker, for GET /v1/devices, /readyz and /metrics. */
 enum worker_state {
 	WORKER_ABSENT,

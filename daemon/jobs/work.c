@@ -100,6 +100,24 @@ bool job_attendable(struct job *job, struct scan_facts *ret_facts)
 	return ret_facts->convertible && !ret_facts->complete && ret_facts->checked;
 }
 
+/* A job that may have no device here goes to the place that has claimed it alone. jobs->lock is held. */
+static bool passes(const struct job *job, const struct job_filter *filter)
+{
+	if (job->entry.elsewhere && job->trial.place == 0)
+		return false;
+	return filter == NULL || filter->fits(filter->context, &job->trial);
+}
+
+static bool passes_now(struct job *job, const struct job_filter *filter)
+{
+	bool does;
+
+	pthread_mutex_lock(&job->jobs->lock);
+	does = passes(job, filter);
+	pthread_mutex_unlock(&job->jobs->lock);
+	return does;
+}
+
 struct job *jobs_arriving(struct jobs *jobs, double since, const struct job_filter *filter, bool *ret_arriving)
 {
 	struct candidate best = {.job = NULL};
@@ -110,8 +128,7 @@ struct job *jobs_arriving(struct jobs *jobs, double since, const struct job_filt
 		struct candidate one = {.job = waiting[i], .priority = waiting[i]->record.priority};
 		struct scan_facts facts;
 
-		if ((filter != NULL && !filter->fits(filter->context, &one.job->trial)) ||
-		    !job_attendable(one.job, &facts))
+		if (!passes_now(one.job, filter) || !job_attendable(one.job, &facts))
 			continue;
 		one.arrived = facts.arrived;
 		one.arriving = facts.arrived > since;
@@ -292,9 +309,7 @@ struct job *job_of_entry(const struct queue_entry *entry)
 
 static bool entry_fits(const void *context, const struct queue_entry *entry)
 {
-	const struct job_filter *filter = context;
-
-	return filter == NULL || filter->fits(filter->context, &job_of_entry(entry)->trial);
+	return passes(job_of_entry(entry), context);
 }
 
 struct job *jobs_next(struct jobs *jobs, const struct job_filter *filter)

@@ -150,6 +150,7 @@ struct supervise {
 	struct worker_facts facts[SLOTS_MAX];
 	struct place places[PLACES_MAX], spent[PLACES_MAX];
 	int place_count, spent_count;
+	struct host_trouble troubles[TROUBLES_MAX];
 	unsigned long long clear; /* bit for each worker that an operator wants cleared */
 	bool stop;
 };
@@ -261,6 +262,8 @@ void remote_tend(struct supervise *supervise);
 void remote_spend(struct supervise *supervise, struct worker *worker);
 /* The job that this slot is there for. */
 bool remote_fits(const struct worker *worker, const struct job_trial *trial);
+/* Why the host of this slot's place cannot be given its job; NULL: it can. */
+void remote_trouble(struct supervise *supervise, const struct worker *worker, const char *why);
 /* How a run on another host ends for its job: what fails there is no failure of the job. */
 enum worker_end remote_end(const struct worker *worker, enum worker_end end, int code);
 

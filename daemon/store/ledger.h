@@ -12,7 +12,7 @@
  * The ledger of a fleet: the schema cbctd_fleet_NAME of a PostgreSQL database, with what several daemons must agree on,
  * which jobs may be computed by another host than their owner, and which host has which of them.
  *
- *   hosts   a row for each daemon: name, address of its API, when it was last seen
+ *   hosts   a row for each daemon: name, address of its API, when it was last seen, memory of its devices
  *   homes   a row for each scan and job: which host has it
  *   offers  a row for each job that others may take: owner, job, priority, place in its owner's queue, where it may
  * run, and once it is claimed the taker, the number of the claim and the end of its lease
@@ -63,14 +63,17 @@ int ledger_check(const struct ledger_options *options, struct error *err) LEDGER
 int ledger_open(const struct ledger_options *options, struct ledger **ret_ledger, struct error *err) LEDGER_WEAK;
 void ledger_close(struct ledger *ledger) LEDGER_WEAK; /* NULL is fine */
 
-/* This host is there: to be called at least every third of a lease. */
-int ledger_seen(struct ledger *ledger, struct error *err) LEDGER_WEAK;
+/* This host is there, with devices of memory[count] bytes: to be called at least every third of a lease. */
+int ledger_seen(struct ledger *ledger, const double *memory, int count, struct error *err) LEDGER_WEAK;
 
 /* ---- which host has what ---- */
 struct fleet_host {
 	char name[LEDGER_NAME_SIZE], url[LEDGER_URL_SIZE];
-	long long changes; /* grows whenever what it has changes */
-	bool away;         /* it was not seen for a lease */
+	long long changes;                 /* grows whenever what it has changes */
+	bool away;                         /* it was not seen for a lease */
+	double unseen;                     /* s since it was seen last */
+	double memory[WHERE_DEVICES_MOST]; /* bytes of each of its devices */
+	int devices;
 };
 /* The ids of this host's scans and jobs are these, at most HOMES_MOST. */
 enum { HOMES_MOST = 4096 };

@@ -64,7 +64,8 @@ static int make_tables(struct ledger *ledger, struct error *err)
 		 "ALTER TABLE offers ADD COLUMN IF NOT EXISTS host text NOT NULL DEFAULT '',"
 		 " ADD COLUMN IF NOT EXISTS memory double precision NOT NULL DEFAULT 0,"
 		 " ADD COLUMN IF NOT EXISTS devices bigint NOT NULL DEFAULT 0;"
-		 "ALTER TABLE hosts ADD COLUMN IF NOT EXISTS changes bigint NOT NULL DEFAULT 0;"
+		 "ALTER TABLE hosts ADD COLUMN IF NOT EXISTS changes bigint NOT NULL DEFAULT 0,"
+		 " ADD COLUMN IF NOT EXISTS memory text NOT NULL DEFAULT '{}';"
 		 "CREATE TABLE IF NOT EXISTS homes (id text COLLATE \"C\" PRIMARY KEY, owner text NOT NULL);"
 		 "CREATE INDEX IF NOT EXISTS homes_of ON homes (owner);"
 		 "COMMIT",
@@ -121,7 +122,7 @@ static int join(struct ledger *ledger, struct error *err)
 	snprintf(sql, sizeof(sql), "LISTEN %s", ledger->schema);
 	if (code == 0)
 		code = session_execute(&ledger->session, sql, NULL, err);
-	return code == 0 ? ledger_seen(ledger, err) : code;
+	return code == 0 ? ledger_seen(ledger, NULL, 0, err) : code;
 }
 
 int ledger_open(const struct ledger_options *options, struct ledger **ret_ledger, struct error *err)
@@ -160,14 +161,46 @@ void ledger_close(struct ledger *ledger)
 	free(ledger);
 }
 
-int ledger_seen(struct ledger *ledger, struct error *err)
-{
-	const struct value values[] = {text_value(ledger->host), text_value(ledger->url)};
+enum { ARRAY_SIZE = WHERE_DEVICES_MOST * 24 + 3 };
 
+/* As PostgreSQL writes an array. */
+static void print_array(const double *numbers, int count, char ret_text[ARRAY_SIZE])
+{
+	size_t length = (size_t)snprintf(ret_text, ARRAY_SIZE, "{");
+
+	for (int i = 0; i < count && i < WHERE_DEVICES_MOST; i++)
+		length +=
+		    (size_t)snprintf(ret_text + length, ARRAY_SIZE - length, "%s%.0f", i > 0 ? "," : "", numbers[i]);
+	snprintf(ret_text + length, ARRAY_SIZE - length, "}");
+}
+
+static int read_array(const char *text, double ret_numbers[WHERE_DEVICES_MOST])
+{
+	int count = 0;
+	char *end;
+
+	for (const char *at = text; (*at == '{' || *at == ',') && count < WHERE_DEVICES_MOST; at = end) {
+		const double number = strtod(at + 1, &end);
+
+		if (end == at + 1)
+			break;
+		ret_numbers[count++] = number;
+	}
+	return count;
+}
+
+int ledger_seen(struct ledger *ledger, const double *memory, int count, struct error *err)
+{
+	struct value values[] = {text_value(ledger->host), text_value(ledger->url), text_value("")};
+	char array[ARRAY_SIZE];
+
+	print_array(memory, count, array);
+	values[2] = text_value(array);
 	return session_run(&ledger->session,
-			   "INSERT INTO hosts (name, url, seen) VALUES ($1::text, $2::text, now())"
-			   " ON CONFLICT (name) DO UPDATE SET url = excluded.url, seen = excluded.seen",
-			   values, 2, NULL, NULL, err);
+			   "INSERT INTO hosts (name, url, seen, memory) VALUES ($1::text, $2::text, now(), $3::text)"
+			   " ON CONFLICT (name) DO UPDATE SET url = excluded.url, seen = excluded.seen,"
+			   " memory = excluded.memory",
+			   values, 3, NULL, NULL, err);
 }
 
 /* ---- claims as rows ---- */
@@ -259,6 +292,8 @@ static int note_host(void *context, const struct value *values, struct error *er
 	*host = (struct fleet_host){.changes = values[2].integer, .away = values[3].integer != 0};
 	snprintf(host->name, sizeof(host->name), "%s", (const char *)values[0].bytes);
 	snprintf(host->url, sizeof(host->url), "%s", (const char *)values[1].bytes);
+	host->unseen = values[4].real;
+	host->devices = read_array(values[5].bytes, host->memory);
 	hosts->count++;
 	return 0;
 }
@@ -269,7 +304,8 @@ int ledger_hosts(struct ledger *ledger, struct fleet_host *ret_hosts, int most, 
 	struct hosts hosts = {.hosts = ret_hosts, .most = most};
 	int code = session_run(&ledger->session,
 			       "SELECT name, url, changes, CASE WHEN seen > now() - $2::float8 * interval '1 second'"
-			       " THEN 0::bigint ELSE 1 END FROM hosts WHERE name <> $1::text ORDER BY seen DESC",
+			       " THEN 0::bigint ELSE 1 END, extract(epoch FROM now() - seen)::float8, memory"
+			       " FROM hosts WHERE name <> $1::text ORDER BY seen DESC",
 			       values, 2, note_host, &hosts, err);
 
 	*ret_count = hosts.count;
@@ -365,26 +401,16 @@ int ledger_claimed(struct ledger *ledger, struct fleet_claim *ret_claims, int mo
 	return code;
 }
 
-/* As PostgreSQL writes an array. */
-static void print_array(const double *numbers, int count, char *ret_text, size_t size)
-{
-	size_t length = (size_t)snprintf(ret_text, size, "{");
-
-	for (int i = 0; i < count; i++)
-		length += (size_t)snprintf(ret_text + length, size - length, "%s%.0f", i > 0 ? "," : "", numbers[i]);
-	snprintf(ret_text + length, size - length, "}");
-}
-
 int ledger_claim(struct ledger *ledger, int least, double age, const double *memory, int devices,
 		 struct fleet_claim *ret_claim, bool *ret_got, struct error *err)
 {
-	char array[WHERE_DEVICES_MOST * 24 + 3];
+	char array[ARRAY_SIZE];
 	struct value values[] = {text_value(ledger->host), integer_value(least), seconds_value(ledger->lease),
 				 seconds_value(age), text_value("")};
 	struct claims claims = {.claims = ret_claim, .most = 1};
 	int code;
 
-	print_array(memory, devices < WHERE_DEVICES_MOST ? devices : WHERE_DEVICES_MOST, array, sizeof(array));
+	print_array(memory, devices, array);
 	values[4] = text_value(array);
 	code = session_run(
 	    &ledger->session,

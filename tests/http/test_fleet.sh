@@ -394,6 +394,54 @@ waits_for_a_host() {
 	req GET "/v1/jobs/$job"
 	expect_json '.state == "queued" and .waiting_for == ["host"] and .start_s == null and .eta_s == null'
 }
+# waits_because WORDS: the job's document says so within some seconds
+waits_because() {
+	local i
+	for ((i = 0; i < 300; i++)); do
+		req GET "/v1/jobs/$job"
+		[[ $(json '.waiting_detail // ""') == *"$1"* ]] && break
+		sleep 0.05
+	done
+	expect_json '.state == "queued" and (.waiting_for | index("host") != null)'
+	[[ $(json .waiting_detail) == *"$1"* ]] || fail "waits because: $1, got $(json .waiting_detail)"
+}
+test_a_job_on_several_devices_goes_where_they_are_and_why_one_waits_is_told() {
+	begin
+	undisturbed "$scan_dir" "$small" small
+	taker a --device-memory 400000000
+	start_host c --device-memory 300000000
+	at c
+	post_scan "$scan_dir"
+	post_projections "$scan_dir"
+	# Nobody has two devices: that is told, and the host with one claims nothing of it.
+	post_job "${small/\"fdk\"/\"devices\": 2, \"fdk\"}"
+	waits_because 'none of the 1 hosts that take jobs just now can run it: 2 devices are wanted'
+	! grep -q 'is claimed' "$work/a.err" || fail "no claim by a host with one device"
+	taker b --workers 2
+	at c
+	wait_job succeeded
+	expect_json '(.device | startswith("b: ")) and .devices == 2 and (.plan | contains("2 "))'
+	# Reasons, at once where they are known.
+	post_job "$(where '{"host": "d"}' "$small")"
+	expect_json '.waiting_for == ["host"] and .waiting_detail == "no host of the fleet has ever been called d"'
+	post_job "$(where '{"host": "a", "memory": 500000000}' "$small")"
+	waits_because 'host a can never run it as it is: it has 1 device of at most 400000000 bytes, and 1 device of 500000000 bytes are wanted'
+	post_job "$(where '{"host": "a"}' "$small")"
+	wait_job succeeded
+	expect_json '.waiting_detail == null and .waiting_for == []'
+	stop_host a KILL
+	sleep "$lease"
+	post_job "$(where '{"host": "a"}' "$small")"
+	waits_because 'host a was last seen'
+	stop_hosts
+	start_daemon --threads 1 --fleet-host cart
+	post_scan "$scan_dir"
+	post_projections "$scan_dir"
+	post_job "$(where '{"host": "b"}' "$small")"
+	expect_json '.waiting_detail == "this host, cart, may not run it by its \"where\", and is in no fleet"'
+	stop_daemon
+}
+
 test_a_job_runs_where_it_says_and_waits_for_a_host_that_is_not_there() {
 	local absent
 	begin
@@ -587,10 +635,26 @@ test_tokens_and_tls_between_daemons() {
 	post_scan "$scan_dir"
 	post_projections "$scan_dir"
 	post_job "$small"
-	sleep 2
-	req GET "/v1/jobs/$job"
-	expect_json '.state == "queued"'
+	waits_because 'host a has claimed jobs and cannot be given them: '
 	stop_host c
+	# A token that may only look, one that nobody knows, one that has expired: told, and no job is held to be at fault.
+	(umask 077
+		cbct token new looks --role view --file "$work/tokens" >"$work/view"
+		cbct token new late --role acquire --expires "$(date -u -d '3 seconds' +%Y-%m-%dT%H:%M:%SZ)" --file "$work/tokens" >"$work/late"
+		sed 's/.$/_/' "$work/token" >"$work/unknown")
+	kill -HUP "$(cat "$work/a.pid")"
+	sleep 3
+	for each in view:'the token shown has the role view' unknown:'it refuses this host' late:'it refuses this host'; do
+		owner c --fleet-token "$work/${each%%:*}" --fleet-cacert "$work/cert.pem"
+		at c
+		waits_because "${each#*:}"
+		req GET /readyz
+		expect_status 503
+		expect_json '.detail | contains("host a cannot be given jobs: ")'
+		grep -q "warning: host a of the fleet has claimed job $job and cannot be given it: .*${each#*:}" "$work/c.err" || fail "a line of the log, got $(tail -3 "$work/c.err")"
+		stop_host c
+		rm -f "$work/c.err"
+	done
 	owner c --fleet-token "$work/token" --fleet-cacert "$work/cert.pem"
 	at c
 	wait_job succeeded

@@ -33,7 +33,7 @@ export function doing(job) {
 		return t('being cancelled')
 	const held = job.waiting_for.map(what => obstacles()[what]).filter(Boolean)
 	if (held.length > 0)
-		return t('waits for {what}', { what: held.join(t(' and ')) })
+		return [t('waits for {what}', { what: held.join(t(' and ')) }), job.waiting_detail].filter(Boolean).join(': ')
 	if (job.state === 'queued')
 		return job.queue_position > 1 ? t('{n} before it', { n: job.queue_position - 1 }) : t('next in the queue')
 	if (job.state === 'waiting')
