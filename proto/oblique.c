@@ -129,9 +129,10 @@ static int columns_within(const struct line *line, const struct grid *grid, int 
 		first = fmax(first, fmin(low, high));
 		last = fmin(last, fmax(low, high));
 	}
-	/* A border that is met but for the rounding counts as within. */
+	/* A border that is met but for the rounding counts as within. A line that hardly moves towards the volume may
+	 * meet it farther off than an int can say. */
 	*ret_end = last < 0 ? 0 : (int)floor(last + 1e-6) + 1;
-	return (int)ceil(first - 1e-6);
+	return (int)ceil(fmin(first, count) - 1e-6);
 }
 
 struct cell {

@@ -80,6 +80,12 @@ test_planes_and_slabs_at_any_angle_are_the_volume_resampled() {
 	cp "$work/body" "$work/straight"
 	req GET "$volume/slice?normal=6.123233995736766e-17,1E0,0"
 	cmp -s "$work/body" "$work/straight" || fail "the same plane by numbers with an exponent"
+	# Layers beyond the volume, along lines that would meet it billions of pixels away.
+	req GET "$volume/slice?normal=0,0,1&up=0,-1,0&thickness=203&mode=max"
+	cp "$work/body" "$work/straight"
+	req GET "$volume/slice?normal=1e-11,0,1&up=0,-1,0&thickness=203&mode=max"
+	expect_status 200
+	cmp -s "$work/body" "$work/straight" || fail "the same slab where it is askew by less than can be seen"
 }
 
 test_the_sides_of_the_picture_are_told() {
