@@ -1,12 +1,13 @@
 /* The page in a real browser, against a real daemon whose jobs are real: run by test_page.sh. */
 import { readFileSync } from 'node:fs'
 import { createRequire } from 'node:module'
+import { pathToFileURL } from 'node:url'
 import {
 	origin, api, post, ended, picture, grayOf, shrink, mirrored, flipped, transposed, correlation, launch, software, withoutGraphics, forbidden, open,
 	realComplaints, shoot, until, expect, test, runTests,
 } from './lib.mjs'
 
-const { SCAN: scan, FINISHED: finished, NAME: name } = process.env
+const { SCAN: scan, FINISHED: finished, NAME: name, SOURCES: sources } = process.env
 const axe = readFileSync(createRequire(import.meta.url).resolve('axe-core/axe.min.js'), 'utf8')
 
 const browser = await launch(software)
@@ -583,6 +584,30 @@ test('rulers and angles are true at any zoom and in turned planes; a region has 
 	expect(exported.measurements.length === 4 && Math.abs(exported.measurements[2].mean_hu - mean) < 0.5 && exported.job === finished, 'all in the file')
 	await page.context().close()
 	await forget()
+})
+
+test('slabs are the daemon\'s at any angle, pixel by pixel', async () => {
+	const [{ samplerOf }, { cross, unit, times }] = await Promise.all(['sample.js', 'vector.js'].map(file => import(pathToFileURL(`${sources}/${file}`))))
+	const { volumes } = await api(`/v1/jobs/${finished}/volumes`), { size, spacing_mm: spacing, origin_mm: corner } = volumes.find(({ name }) => name === 'final')
+	const reply = await fetch(`${origin}/v1/jobs/${finished}/volumes/final?format=raw&type=int16`)
+	const grid = { size, spacing, origin: corner, voxels: new Int16Array(await reply.arrayBuffer()) }
+	const middle = corner.map((start, i) => start + (size[i] - 1) / 2 * spacing[i]), [width, height, pixel] = [60, 56, 2.3], list = numbers => numbers.map(part => part.toFixed(9)).join(',')
+	/* Gray levels of 10 HU, root of the mean square: of a thin slab only what rounding does, of others what the nearest voxel of 3 mm is off from what is between voxels. */
+	const offMost = { thin: 0.3, mean: 5, max: 8, min: 8 }
+	for (const [towards, above] of [[[0, 0, 1], [0, 1, 0]], [[1, 0, 0], [0, 0, 1]], [[0, 1, 0], [0, 0, 1]], [[0.3, 1, 0.2], [0, 0, 1]], [[1, 0.4, -0.5], [0.3, 1, 0.2]], [[1, -1, 1], [1, 1, 0.3]]]) {
+		const normal = unit(towards), right = unit(cross(above, normal)), down = cross(right, normal), center = [middle[0] + 4.1, middle[1] - 3.3, middle[2] + 5.2]
+		for (const thickness of [4, 12, 30]) {
+			for (const mode of ['mean', 'max', 'min']) {
+				const values = new Float32Array(width * height)
+				samplerOf(grid, { center, right, down }, width, height, [pixel, pixel], { thickness, mode })(values)
+				const { pixels } = await picture(`/v1/jobs/${finished}/volumes/final/slice?normal=${list(normal)}&up=${list(times(down, -1))}&center=${list(center)}&size=${width},${height}&spacing=${pixel}&thickness=${thickness}&mode=${mode}&window=2600&level=200`)
+				const off = values.map((value, i) => Math.abs((value === value ? Math.min(Math.max((value + 1100) * 255 / 2600, 0), 255) : 0) - pixels[i]))
+				const root = Math.sqrt(off.reduce((sum, one) => sum + one ** 2, 0) / off.length), what = `${mode} of ${thickness} mm along ${towards}`
+				expect(root <= offMost[thickness === 4 ? 'thin' : mode], `${what}: off by ${root}`)
+				expect(off.filter(one => one > 60).length <= 0.002 * off.length, `${what}: the same outline`)
+			}
+		}
+	}
 })
 
 /* ---- numbers ---- */

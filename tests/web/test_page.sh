@@ -134,7 +134,7 @@ browser_tests() {
 	fi
 	read -r url scan job <"$work/prepared"
 	cp "$here"/*.mjs "$tools/"
-	URL=$url OUT=$work SCAN=$scan FINISHED=$job NAME=$name CHROMIUM=$CHROMIUM HOME=$work timeout -k 20 600 node "$tools/page.mjs" 2>&1 | tee "$work/browser.log"
+	URL=$url OUT=$work SCAN=$scan FINISHED=$job NAME=$name SOURCES=$top/clients/web/src CHROMIUM=$CHROMIUM HOME=$work timeout -k 20 600 node "$tools/page.mjs" 2>&1 | tee "$work/browser.log"
 	status=${PIPESTATUS[0]}
 	# the same job where the daemon asks who it is
 	stop_daemon

@@ -14,7 +14,7 @@ import { Gestures } from './gestures.js'
 import { t } from './lang.js'
 
 const narrowMost = 280, tinyMost = 170 /* px: below, there is no room for words beside the letters, nor for letters beside the plane's name */
-const quickMost = 4.5e6 /* samples that the planes in sight take at once; a finer picture follows, piece by piece */
+const quickMost = 6e6 /* samples that the planes in sight take at once; a finer picture follows, piece by piece */
 const restTime = 120 /* ms after which it does */
 const pieceTime = 12 /* ms of a frame for it */
 
@@ -258,8 +258,10 @@ export class Plane {
 	/* A coarse picture at once where a fine one would take long; the fine one once the hand rests. */
 	#drawSamples() {
 		const view = this.#view, grid = this.#grid, frame = view.frame(this.name), { slab } = view
-		const fine = this.#pitch(), samples = frame.width * frame.height / fine ** 2 * layersOf(frame, slab, grid)
-		const coarse = fine * Math.max(1, Math.sqrt(samples / (view.tile === this.name ? quickMost : quickMost / 3)))
+		const fine = this.#pitch(), voxel = Math.min(...grid.spacing), layers = layersOf(frame, slab, grid)
+		const most = view.tile === this.name ? quickMost : quickMost / 3, quick = Math.sqrt(frame.width * frame.height * layers / most)
+		/* The rays of a slab lie whole voxels apart. */
+		const coarse = Math.max(fine, layers > 1 ? Math.ceil(quick / voxel) * voxel : quick)
 		this.#sample(frame, coarse, slab)
 		if (coarse > fine)
 			this.#rest = setTimeout(() => this.#refine(frame, fine, slab), restTime)
@@ -276,7 +278,7 @@ export class Plane {
 		this.#put(values, width, height)
 	}
 
-	/* Row by row, a little in each frame; whatever changes meanwhile begins anew (#drawHere). */
+	/* Part by part, a little in each frame; whatever changes meanwhile begins anew (#drawHere). */
 	#refine(frame, pitch, slab) {
 		const grid = this.#grid, [width, height] = this.#sizeOf(frame, pitch), values = new Float32Array(width * height)
 		const sample = samplerOf(grid, frame, width, height, [frame.width / width, frame.height / height], slab)
@@ -285,6 +287,8 @@ export class Plane {
 			const end = performance.now() + pieceTime
 			if (this.#grid !== grid || !this.element.isConnected)
 				return
+			while (performance.now() < end && sample.prepare())
+				;
 			while (row < height && performance.now() < end) {
 				const rows = Math.min(8, height - row)
 				sample(values, row, row + rows)

@@ -6,6 +6,9 @@
  * right angles. slab: { thickness (mm, 0: a plane), mode: mean, max or min }.
  */
 import { cross } from './vector.js'
+import { slabOf } from './slab.js'
+
+const thinMost = 3 /* layers of a slab that are interpolated one by one; of a thicker one what is between voxels averages out */
 
 /* How many samples there are through a slab: at most a voxel apart along its normal. */
 export function layersOf(frame, { thickness }, { spacing }) {
@@ -52,27 +55,49 @@ function stepsOf({ spacing, origin }, frame, width, height, pixel, layers, thick
 
 /*
  * What draws such a picture: a function (values, from, to) that fills rows from .. to - 1 of values [height][width] (Float32Array), pixels
- * of `pixel` ([across, down], mm) about the frame's center; NaN where there is no volume. All that the loops need is in variables of
- * their own: engines then keep it in registers.
+ * of `pixel` ([across, down], mm) about the frame's center; NaN where there is no volume. Its `prepare` does a part of what must be done
+ * before, some milliseconds at most, and says whether there is more. All that the loops need is in variables of their own: engines then
+ * keep it in registers.
  */
 export function samplerOf(grid, frame, width, height, pixel, slab) {
-	const layers = layersOf(frame, slab, grid), steps = stepsOf(grid, frame, width, height, pixel, layers, slab.thickness)
-	const through = layers > 1 ? throughOf(grid, steps.layer, layers, slab.mode) : null
-	return (values, from = 0, to = height) => {
-		if (through !== null)
-			drawSlab(grid, steps, through, from, to, width, values)
-		for (let row = from; row < to && through === null; row++)
-			drawPlane(grid, steps, row, width, values)
+	const layers = layersOf(frame, slab, grid)
+	if (layers > thinMost)
+		return slabOf(grid, frame, width, height, pixel, slab, layers)
+	const steps = stepsOf(grid, frame, width, height, pixel, layers, slab.thickness)
+	const sample = (values, from = 0, to = height) => {
+		for (let row = from; row < to; row++)
+			layers === 1 ? drawPlane(grid, steps, row, 0, width, values, row * width) : drawThin(grid, steps, row, layers, slab.mode, width, values)
 	}
+	return Object.assign(sample, { prepare: () => false })
 }
 
-function drawPlane(grid, steps, row, width, values) {
+/* Of a thin slab every layer is a plane. */
+function drawThin(grid, steps, row, layers, mode, width, values) {
+	const line = new Float32Array(width), counts = new Int32Array(width), at = row * width
+	values.fill(NaN, at, at + width)
+	for (let layer = 0; layer < layers; layer++) {
+		drawPlane(grid, steps, row, layer, width, line, 0)
+		for (let c = 0; c < width; c++) {
+			const value = line[c], so = values[at + c]
+			if (value !== value)
+				continue
+			values[at + c] = counts[c]++ === 0 ? value : mode === 'mean' ? so + value : mode === 'max' ? Math.max(so, value) : Math.min(so, value)
+		}
+	}
+	for (let c = 0; c < width && mode === 'mean'; c++)
+		values[at + c] /= counts[c]
+}
+
+/* A row of one layer, into values from `to` on. */
+function drawPlane(grid, steps, row, layer, width, values, to) {
 	const voxels = grid.voxels, nx = grid.size[0], ny = grid.size[1], nz = grid.size[2]
 	const mx = nx - 1, my = ny - 1, mz = nz - 1, lastX = Math.max(nx - 2, 0), lastY = Math.max(ny - 2, 0), lastZ = Math.max(nz - 2, 0)
 	const right = nx > 1 ? 1 : 0, down = ny > 1 ? nx : 0, deep = nz > 1 ? nx * ny : 0, plane = nx * ny
 	const cx = steps.column[0], cy = steps.column[1], cz = steps.column[2]
-	const x0 = steps.start[0] + row * steps.row[0], y0 = steps.start[1] + row * steps.row[1], z0 = steps.start[2] + row * steps.row[2]
-	for (let c = 0, to = row * width; c < width; c++, to++) {
+	const x0 = steps.start[0] + row * steps.row[0] + layer * steps.layer[0]
+	const y0 = steps.start[1] + row * steps.row[1] + layer * steps.layer[1]
+	const z0 = steps.start[2] + row * steps.row[2] + layer * steps.layer[2]
+	for (let c = 0; c < width; c++, to++) {
 		let x = x0 + c * cx, y = y0 + c * cy, z = z0 + c * cz
 		if (!(x >= -0.5 && y >= -0.5 && z >= -0.5 && x <= mx + 0.5 && y <= my + 0.5 && z <= mz + 0.5)) {
 			values[to] = NaN
@@ -96,125 +121,3 @@ function drawPlane(grid, steps, row, width, values) {
 		values[to] = low + z * (d + y * (e - d) - low)
 	}
 }
-
-/*
- * Through a slab each sample is the nearest voxel's: what is between the layers averages out or has no larger value than
- * the voxels themselves, at a fraction of the time. Where the samples of a pixel begin is rounded to a quarter of a voxel:
- * within a voxel there are 64 such places, and for each of them a table has how far in memory each layer's voxel is.
- */
-const parts = 4
-
-/* table [part of z][of y][of x][layer]; x, y, z: the step from layer to layer, rounded so that sums of it are exact. */
-function throughOf({ size: [nx, ny] }, step, layers, mode) {
-	const [x, y, z] = step.map(part => Math.round(part * 2 ** 20) / 2 ** 20), table = new Int32Array(parts ** 3 * layers)
-	const place = (part, layer, along) => Math.floor((part + 0.5) / parts + layer * along)
-	let at = 0
-	for (let c = 0; c < parts; c++)
-		for (let b = 0; b < parts; b++)
-			for (let a = 0; a < parts; a++)
-				for (let layer = 0; layer < layers; layer++)
-					table[at++] = (place(c, layer, z) * ny + place(b, layer, y)) * nx + place(a, layer, x)
-	const tile = [x, y, z].filter(part => part !== 0).length > 1 ? 16 : Infinity /* pixels */
-	/* Of up to four pixels: the voxel where each begins, and its row of the table. */
-	return { table, layers, mode, tile, x, y, z, bases: new Int32Array(4), rows: new Int32Array(4) }
-}
-
-/* Square by square where layers lie askew: what one row fetches into the processor's caches then serves the next ones. */
-function drawSlab(grid, steps, through, from, to, width, values) {
-	const { tile } = through
-	for (let top = from; top < to; top += tile) {
-		const bottom = Math.min(top + tile, to)
-		for (let left = 0; left < width; left += tile) {
-			for (let row = top; row < bottom; row++)
-				drawPart(grid, steps, through, row, left, Math.min(left + tile, width), width, values)
-		}
-	}
-}
-
-/*
- * Of a row, columns left .. right - 1. Pixels whose samples all lie in the volume are taken four at a time: the processor
- * waits for four voxels at once.
- */
-function drawPart(grid, steps, through, row, left, right, width, values) {
-	const voxels = grid.voxels, nx = grid.size[0], ny = grid.size[1], nz = grid.size[2], plane = nx * ny
-	const { layers, bases, rows, x: lx, y: ly, z: lz } = through, last = layers - 1
-	const cx = steps.column[0], cy = steps.column[1], cz = steps.column[2]
-	/* Half a voxel further: the voxel at a point is then what is before the point of its number. */
-	const x0 = steps.start[0] + row * steps.row[0] + 0.5, y0 = steps.start[1] + row * steps.row[1] + 0.5, z0 = steps.start[2] + row * steps.row[2] + 0.5
-	let held = 0
-	const letGo = to => {
-		for (let i = 0; i < held; i++)
-			values[to - held + i] = oneThrough(voxels, through, i, 0, layers)
-		held = 0
-	}
-	for (let c = left, to = row * width + left; c < right; c++, to++) {
-		const i = Math.floor((x0 + c * cx) * parts), j = Math.floor((y0 + c * cy) * parts), k = Math.floor((z0 + c * cz) * parts)
-		const x = (i + 0.5) / parts, y = (j + 0.5) / parts, z = (k + 0.5) / parts
-		const whole = within(x, y, z, nx, ny, nz) && within(x + last * lx, y + last * ly, z + last * lz, nx, ny, nz)
-		if (!whole)
-			letGo(to)
-		bases[held] = Math.floor(z) * plane + Math.floor(y) * nx + Math.floor(x)
-		rows[held] = (((k & 3) * parts + (j & 3)) * parts + (i & 3)) * layers
-		if (whole) {
-			if (++held === 4) {
-				fourThrough(voxels, through, values, to - 3)
-				held = 0
-			}
-			continue
-		}
-		let first = 0, end = layers
-		while (first < end && !within(x + first * lx, y + first * ly, z + first * lz, nx, ny, nz))
-			first++
-		while (end > first && !within(x + (end - 1) * lx, y + (end - 1) * ly, z + (end - 1) * lz, nx, ny, nz))
-			end--
-		values[to] = first < end ? oneThrough(voxels, through, 0, first, end) : NaN
-	}
-	letGo(row * width + right)
-}
-
-/* Layers first .. end - 1 of one of the pixels. */
-function oneThrough(voxels, { table, mode, bases, rows }, which, first, end) {
-	const base = bases[which], row = rows[which]
-	let found = voxels[base + table[row + first] | 0]
-	for (let k = row + first + 1; k < row + end; k++) {
-		const sample = voxels[base + table[k] | 0]
-		found = mode === 'mean' ? found + sample : mode === 'max' ? Math.max(found, sample) : Math.min(found, sample)
-	}
-	return mode === 'mean' ? found / (end - first) : found
-}
-
-/* All layers of the four, into values from `to` on. */
-function fourThrough(voxels, { table, layers, mode, bases, rows }, values, to) {
-	const base0 = bases[0], base1 = bases[1], base2 = bases[2], base3 = bases[3]
-	let a = rows[0], b = rows[1], c = rows[2], d = rows[3]
-	const end = a + layers
-	if (mode === 'mean') {
-		let sum0 = 0, sum1 = 0, sum2 = 0, sum3 = 0
-		for (; a < end; a++, b++, c++, d++) {
-			sum0 = sum0 + voxels[base0 + table[a] | 0] | 0
-			sum1 = sum1 + voxels[base1 + table[b] | 0] | 0
-			sum2 = sum2 + voxels[base2 + table[c] | 0] | 0
-			sum3 = sum3 + voxels[base3 + table[d] | 0] | 0
-		}
-		values[to] = sum0 / layers
-		values[to + 1] = sum1 / layers
-		values[to + 2] = sum2 / layers
-		values[to + 3] = sum3 / layers
-		return
-	}
-	/* The least is the largest of what has all its bits turned over. */
-	const turned = mode === 'max' ? 0 : -1
-	let most0 = -32769, most1 = -32769, most2 = -32769, most3 = -32769
-	for (; a < end; a++, b++, c++, d++) {
-		most0 = Math.max(most0, voxels[base0 + table[a] | 0] ^ turned)
-		most1 = Math.max(most1, voxels[base1 + table[b] | 0] ^ turned)
-		most2 = Math.max(most2, voxels[base2 + table[c] | 0] ^ turned)
-		most3 = Math.max(most3, voxels[base3 + table[d] | 0] ^ turned)
-	}
-	values[to] = most0 ^ turned
-	values[to + 1] = most1 ^ turned
-	values[to + 2] = most2 ^ turned
-	values[to + 3] = most3 ^ turned
-}
-
-const within = (x, y, z, nx, ny, nz) => x >= 0 && y >= 0 && z >= 0 && x < nx && y < ny && z < nz
