@@ -122,6 +122,7 @@ static void write_text(enum log_level level, const char *text)
 /* False when memory has run out. */
 static bool write_json(enum log_level level, const char *text)
 {
+	bool missing = json_set_missing(false); /* of a tree in whose midst this line is written */
 	cJSON *line = cJSON_CreateObject();
 	char now[CLOCK_TEXT_SIZE], *printed;
 	struct fact subject;
@@ -137,8 +138,9 @@ static bool write_json(enum log_level level, const char *text)
 		cJSON_AddStringToObject(line, "trace", trace_now);
 	if (read_subject(text, &subject))
 		cJSON_AddStringToObject(line, subject.name, subject.value);
-	printed = line != NULL ? json_print(line, &length) : NULL;
+	printed = json_print(line, &length);
 	cJSON_Delete(line);
+	json_set_missing(missing);
 	if (printed == NULL)
 		return false;
 	printed[length] = '\n'; /* in place of the zero byte */

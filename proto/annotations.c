@@ -115,7 +115,7 @@ static int read_list(struct json_reader *reader, const char *name,
 		if (reader->code == 0)
 			reader->code = read(entry, base, reader->err);
 	}
-	cJSON_AddItemToObject(document, name, cJSON_Duplicate(list, true));
+	json_add(document, name, cJSON_Duplicate(list, true));
 	return reader->code;
 }
 

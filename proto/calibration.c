@@ -363,7 +363,7 @@ cJSON *calibration_json(const struct calibration *calibration)
 		views[k] = calibration->views[k].view;
 		cJSON_AddItemToArray(list, view_json(&calibration->views[k]));
 	}
-	cJSON_AddItemToObject(json, "geometry", matrices_json(views, calibration->count));
+	json_add(json, "geometry", matrices_json(views, calibration->count));
 	free(views);
 	return json;
 }

@@ -185,8 +185,7 @@ static int read_balls(const cJSON *result, struct calibrated *calibrated, struct
 	cJSON *phantom = cJSON_CreateObject();
 	int code;
 
-	cJSON_AddItemToObject(phantom, "balls_mm",
-			      cJSON_Duplicate(cJSON_GetObjectItemCaseSensitive(result, "balls_mm"), true));
+	json_add(phantom, "balls_mm", cJSON_Duplicate(cJSON_GetObjectItemCaseSensitive(result, "balls_mm"), true));
 	code = balls_read(phantom, &calibrated->balls, err);
 	cJSON_Delete(phantom);
 	return code;

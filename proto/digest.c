@@ -39,7 +39,7 @@ static int digest_bytes(const void *bytes, size_t size, char ret_text[DIGEST_TEX
 static int digest_json(const cJSON *value, char ret_text[DIGEST_TEXT_MAX], struct error *err)
 {
 	size_t length = 0;
-	char *text = value != NULL ? json_print(value, &length) : NULL;
+	char *text = json_print(value, &length);
 	int code = text != NULL ? digest_bytes(text, length, ret_text, err)
 				: error_set(err, ERR_NO_MEMORY, "no memory for the digest of a document");
 

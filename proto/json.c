@@ -438,6 +438,7 @@ int json_parse(const char *text, size_t length, cJSON **ret_value, struct error 
 {
 	struct scanner s = {.text = text, .length = length, .err = err};
 	char pointer[POINTER_MAX] = "";
+	bool missing;
 	cJSON *value;
 	int code;
 
@@ -451,7 +452,9 @@ int json_parse(const char *text, size_t length, cJSON **ret_value, struct error 
 		return code;
 	if (s.at != length)
 		return scan_fail(&s, ERR_INVALID, "text after the end of the value");
+	missing = json_set_missing(false);
 	value = cJSON_ParseWithLength(text, length);
+	json_set_missing(missing);
 	if (value == NULL)
 		return error_set(err, ERR_NO_MEMORY, "no memory for JSON of %zu bytes", length);
 	code = check_tree(value, pointer, err);
@@ -464,6 +467,45 @@ int json_parse(const char *text, size_t length, cJSON **ret_value, struct error 
 }
 
 /* ---- printing ---- */
+
+static _Thread_local bool missing_now;
+
+bool json_set_missing(bool missing)
+{
+	bool before = missing_now;
+
+	missing_now = missing;
+	return before;
+}
+
+void json_missing_for(const struct error *err)
+{
+	if (err->code == ERR_NO_MEMORY)
+		missing_now = true;
+}
+
+static void *allocate(size_t size)
+{
+	void *memory = malloc(size);
+
+	if (memory == NULL)
+		missing_now = true;
+	return memory;
+}
+
+/* Before any program's first tree. */
+__attribute__((constructor)) static void remember_what_is_missing(void)
+{
+	cJSON_InitHooks(&(cJSON_Hooks){.malloc_fn = allocate, .free_fn = free});
+}
+
+bool json_add(cJSON *object, const char *name, cJSON *value)
+{
+	if (value != NULL && cJSON_AddItemToObject(object, name, value))
+		return true;
+	cJSON_Delete(value);
+	return false;
+}
 
 struct printer {
 	char *text;
@@ -577,9 +619,12 @@ static void put_value(struct printer *p, const cJSON *value)
 
 char *json_print(const cJSON *value, size_t *ret_length)
 {
-	struct printer p = {0};
+	struct printer p = {.failed = value == NULL};
 
-	put_value(&p, value);
+	if (json_set_missing(false))
+		p.failed = true;
+	if (!p.failed)
+		put_value(&p, value);
 	if (p.failed) {
 		free(p.text);
 		return NULL;

@@ -29,11 +29,23 @@ enum {
 int json_parse(const char *text, size_t length, cJSON **ret_value, struct error *err);
 
 /*
- * Compact text of a tree, to be freed with free, NULL for no memory. Unlike
+ * Compact text of a tree, to be freed with free, NULL for no memory, or for no value. Unlike
  * cJSON's own printer, numbers come back as the same double, what is not finite
  * is null, and bytes that are not UTF-8 become U+FFFD: it is always JSON.
  */
 char *json_print(const cJSON *value, size_t *ret_length /* may be NULL */);
+
+/* Adds a value that is the caller's no longer, whatever comes of it; false for no memory, or no value. */
+bool json_add(cJSON *object, const char *name, cJSON *value);
+
+/*
+ * cJSON leaves a member out without a word where there is no memory for it. It is remembered, for each thread: the next
+ * json_print gives NULL then, whose tree it was. Returns whether something is missing so far and sets it, for who
+ * begins with a tree after others were dropped (false), or prints one while another is made.
+ */
+bool json_set_missing(bool missing);
+/* For who leaves a member out for an error: one for want of memory counts like cJSON's own. */
+void json_missing_for(const struct error *err);
 
 /* The shortest of 15, 16 or 17 digits that reads back to the same double; the number is finite. */
 enum { NUMBER_TEXT_MAX = 32 };

@@ -237,8 +237,7 @@ static cJSON *message_json(const struct message *message)
 	for (const struct field *field = kinds[message->kind].fields; field->name != NULL; field++) {
 		cJSON *member = field_json(field, message);
 
-		if (member == NULL || !cJSON_AddItemToObject(value, field->name, member)) {
-			cJSON_Delete(member);
+		if (!json_add(value, field->name, member)) {
 			cJSON_Delete(value);
 			return NULL;
 		}
@@ -270,7 +269,7 @@ int message_send(int socket, const struct message *message, struct error *err)
 {
 	cJSON *value = message_json(message);
 	size_t length = 0;
-	char *text = value != NULL ? json_print(value, &length) : NULL;
+	char *text = json_print(value, &length);
 	int code;
 
 	cJSON_Delete(value);

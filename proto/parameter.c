@@ -192,15 +192,6 @@ static cJSON *holder_of(cJSON *json, const char **name)
 	return json;
 }
 
-/* cJSON adds nothing and says so where the value is NULL; a value that cannot be added is the caller's still. */
-static bool add_value(cJSON *json, const char *name, cJSON *value)
-{
-	if (json != NULL && cJSON_AddItemToObject(json, name, value))
-		return true;
-	cJSON_Delete(value);
-	return false;
-}
-
 bool parameters_add(cJSON *json, const struct parameter_set *set, const void *record)
 {
 	for (int row = 0; row < set->count; row++) {
@@ -212,7 +203,7 @@ bool parameters_add(cJSON *json, const struct parameter_set *set, const void *re
 		    (parameter->presets == PRESET_OPEN && parameter_get(parameter, record, 0) == 0))
 			continue;
 		holder = holder_of(json, &name);
-		if (holder == NULL || !add_value(holder, name, value_json(parameter, record)))
+		if (holder == NULL || !json_add(holder, name, value_json(parameter, record)))
 			return false;
 	}
 	return true;
@@ -232,15 +223,15 @@ static bool add_range(cJSON *json, const struct parameter *parameter)
 	bool added = true;
 
 	if (parameter->names != NULL)
-		return add_value(json, "choices", cJSON_CreateStringArray(parameter->names, parameter->count));
+		return json_add(json, "choices", cJSON_CreateStringArray(parameter->names, parameter->count));
 	if (parameter->type == PARAMETER_FLAG)
 		return true;
-	added = add_value(json, "minimum", cJSON_CreateNumber(parameter->least)) &&
-		add_value(json, "maximum", cJSON_CreateNumber(parameter->most));
+	added = json_add(json, "minimum", cJSON_CreateNumber(parameter->least)) &&
+		json_add(json, "maximum", cJSON_CreateNumber(parameter->most));
 	if (added && parameter_is_list(parameter))
-		added = add_value(json, "count", cJSON_CreateNumber(parameter->count));
+		added = json_add(json, "count", cJSON_CreateNumber(parameter->count));
 	if (added && parameter->word != NULL)
-		added = add_value(json, "word", cJSON_CreateString(parameter->word));
+		added = json_add(json, "word", cJSON_CreateString(parameter->word));
 	return added;
 }
 
@@ -253,13 +244,13 @@ cJSON *parameter_json(const struct parameter *parameter, const char *object, con
 	bool added;
 
 	parameter_pointer(parameter, object, pointer);
-	added = json != NULL && add_value(json, "pointer", cJSON_CreateString(pointer)) &&
-		add_value(json, "type", cJSON_CreateString(types[parameter->type])) &&
-		add_value(json, "required", cJSON_CreateBool(parameter->presets == PRESET_REQUIRED)) &&
-		add_value(json, "default", default_json(parameter, record)) && add_range(json, parameter) &&
-		add_value(json, "help", cJSON_CreateString(parameter->help));
+	added = json != NULL && json_add(json, "pointer", cJSON_CreateString(pointer)) &&
+		json_add(json, "type", cJSON_CreateString(types[parameter->type])) &&
+		json_add(json, "required", cJSON_CreateBool(parameter->presets == PRESET_REQUIRED)) &&
+		json_add(json, "default", default_json(parameter, record)) && add_range(json, parameter) &&
+		json_add(json, "help", cJSON_CreateString(parameter->help));
 	if (added && parameter->unit != NULL)
-		added = add_value(json, "unit", cJSON_CreateString(parameter->unit));
+		added = json_add(json, "unit", cJSON_CreateString(parameter->unit));
 	if (added)
 		return json;
 	cJSON_Delete(json);

@@ -153,10 +153,8 @@ cJSON *patient_json(const struct patient *patient)
 		value = cJSON_CreateString(patient_position_names[patient->position]);
 	else
 		value = cJSON_CreateDoubleArray(numbers, 16);
-	if (value != NULL &&
-	    cJSON_AddItemToObject(json, patient->position >= 0 ? "position" : "world_to_patient", value))
+	if (json_add(json, patient->position >= 0 ? "position" : "world_to_patient", value))
 		return json;
-	cJSON_Delete(value);
 	cJSON_Delete(json);
 	return NULL;
 }

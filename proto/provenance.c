@@ -42,7 +42,7 @@ static void add_images(cJSON *json, const struct provenance *provenance)
 		add_text(images, image_kinds[i].name, provenance->image_digest[i]);
 	add_text(images, "scatter", provenance->scatter_digest);
 	if (images != NULL && images->child != NULL)
-		cJSON_AddItemToObject(json, "images", images);
+		json_add(json, "images", images);
 	else
 		cJSON_Delete(images);
 }
@@ -61,7 +61,7 @@ cJSON *provenance_json(const struct provenance *provenance, const char *unit)
 	}
 	add_images(json, provenance);
 	cJSON_AddStringToObject(json, "left_right", patient->known ? "known" : "not known");
-	cJSON_AddItemToObject(json, "patient", patient_json(patient));
+	json_add(json, "patient", patient_json(patient));
 	if (patient->known) {
 		matrix = cJSON_AddArrayToObject(json, "world_to_patient");
 		for (int i = 0; i < 16; i++) {
@@ -74,7 +74,7 @@ cJSON *provenance_json(const struct provenance *provenance, const char *unit)
 		}
 	}
 	if (provenance->recipe != NULL)
-		cJSON_AddItemToObject(json, "recipe", cJSON_Duplicate(provenance->recipe, true));
+		json_add(json, "recipe", cJSON_Duplicate(provenance->recipe, true));
 	return json;
 }
 
@@ -164,7 +164,7 @@ static unsigned long next_character(const unsigned char **at)
 char *provenance_text(const cJSON *json)
 {
 	size_t length = 0, used = 0;
-	char *text = json != NULL ? json_print(json, &length) : NULL;
+	char *text = json_print(json, &length);
 	/* Two bytes become six at most, four become twelve. */
 	char *ascii = text != NULL ? malloc(3 * length + 1) : NULL;
 	const unsigned char *at = (const unsigned char *)text;

@@ -95,12 +95,11 @@ static cJSON *from_keys(const char *head, size_t length, bool nrrd)
 		is_text = !in_recipe;
 		for (size_t i = 0; i < sizeof(no_texts) / sizeof(no_texts[0]); i++)
 			is_text = is_text && strcmp(row + sizeof(own) - 1, no_texts[i]) != 0;
-		cJSON_AddItemToObject(in_recipe ? recipe : json,
-				      row + (in_recipe ? sizeof(of_recipe) : sizeof(own)) - 1,
-				      value_of(value, is_text));
+		json_add(in_recipe ? recipe : json, row + (in_recipe ? sizeof(of_recipe) : sizeof(own)) - 1,
+			 value_of(value, is_text));
 	}
 	if (recipe != NULL && recipe->child != NULL)
-		cJSON_AddItemToObject(json, "recipe", recipe);
+		json_add(json, "recipe", recipe);
 	else
 		cJSON_Delete(recipe);
 	if (json != NULL && json->child != NULL)

@@ -366,15 +366,6 @@ int job_request_resolve(struct job_request *request, const struct scan *scan, st
 
 /* ---- writing ---- */
 
-/* The value is the caller's no longer, whatever comes of it. */
-static bool add(cJSON *document, const char *name, cJSON *value)
-{
-	if (value != NULL && cJSON_AddItemToObject(document, name, value))
-		return true;
-	cJSON_Delete(value);
-	return false;
-}
-
 /* The object `name` with the recipe's parameters of `object`; null for a stage that is off. */
 static bool add_stage(cJSON *document, const char *name, const char *object, bool on, const struct recipe *recipe)
 {
@@ -382,7 +373,7 @@ static bool add_stage(cJSON *document, const char *name, const char *object, boo
 	cJSON *stage;
 
 	if (!on)
-		return add(document, name, cJSON_CreateNull());
+		return json_add(document, name, cJSON_CreateNull());
 	stage = cJSON_AddObjectToObject(document, name);
 	return stage != NULL && parameters_add(stage, &set, recipe);
 }
@@ -450,14 +441,14 @@ cJSON *job_request_json(const struct job_request *request)
 {
 	cJSON *document = recipe_json(&request->recipe);
 
-	if (document != NULL && add(document, "scan", cJSON_CreateString(request->scan)) &&
-	    add(document, "patient", patient_json(&request->patient)) &&
-	    (request->labels == NULL || add(document, "labels", cJSON_Parse(request->labels))) &&
-	    (request->send == NULL || add(document, "send", cJSON_Parse(request->send))) &&
-	    (where_is_any(&request->where) || add(document, "where", where_json(&request->where))) &&
-	    (request->resume == 0 || add(document, "resume", cJSON_CreateNumber(request->resume))) &&
+	if (document != NULL && json_add(document, "scan", cJSON_CreateString(request->scan)) &&
+	    json_add(document, "patient", patient_json(&request->patient)) &&
+	    (request->labels == NULL || json_add(document, "labels", cJSON_Parse(request->labels))) &&
+	    (request->send == NULL || json_add(document, "send", cJSON_Parse(request->send))) &&
+	    (where_is_any(&request->where) || json_add(document, "where", where_json(&request->where))) &&
+	    (request->resume == 0 || json_add(document, "resume", cJSON_CreateNumber(request->resume))) &&
 	    add_emit(document, &request->recipe) &&
-	    add(document, "priority", cJSON_CreateString(priority_names[request->priority])) &&
+	    json_add(document, "priority", cJSON_CreateString(priority_names[request->priority])) &&
 	    add_devices(document, request))
 		return document;
 	cJSON_Delete(document);

@@ -456,11 +456,10 @@ static int find_calibration(const struct scan *scan, cJSON *document, const stru
 		code = calibrations->find(calibrations->context, id, scan, angles, &geometry, notes, reader->err);
 	if (code == 0) {
 		matrices = matrices_json(geometry.views, geometry.count);
-		cJSON_AddItemToObject(document, "matrices",
-				      cJSON_DetachItemFromObjectCaseSensitive(matrices, "matrices"));
+		json_add(document, "matrices", cJSON_DetachItemFromObjectCaseSensitive(matrices, "matrices"));
 		cJSON_Delete(matrices);
 		cJSON_DeleteItemFromObjectCaseSensitive(document, "notes");
-		cJSON_AddItemToObject(document, "notes", notes);
+		json_add(document, "notes", notes);
 		notes = NULL;
 	}
 	cJSON_Delete(notes);

@@ -168,10 +168,10 @@ char *sends_text(const struct send_wish *wishes, int count)
 		cJSON *one = cJSON_CreateObject();
 
 		cJSON_AddStringToObject(one, "to", wishes[i].to);
-		cJSON_AddItemToObject(one, "volumes", send_volumes_json(wishes[i].volumes));
+		json_add(one, "volumes", send_volumes_json(wishes[i].volumes));
 		cJSON_AddItemToArray(list, one);
 	}
-	text = list != NULL ? json_print(list, NULL) : NULL;
+	text = json_print(list, NULL);
 	cJSON_Delete(list);
 	return text;
 }

@@ -33,23 +33,15 @@ int where_read(const cJSON *value, const char *base, struct where *ret, struct e
 	return code;
 }
 
-static bool add(cJSON *document, const char *name, cJSON *value)
-{
-	if (value != NULL && cJSON_AddItemToObject(document, name, value))
-		return true;
-	cJSON_Delete(value);
-	return false;
-}
-
 cJSON *where_json(const struct where *where)
 {
 	cJSON *document = cJSON_CreateObject();
 
 	if (document != NULL &&
-	    add(document, "host", where->host[0] != '\0' ? cJSON_CreateString(where->host) : cJSON_CreateNull()) &&
-	    add(document, "memory", where->memory > 0 ? cJSON_CreateNumber(where->memory) : cJSON_CreateNull()) &&
-	    add(document, "devices",
-		where->devices > 0 ? cJSON_CreateNumber((double)where->devices) : cJSON_CreateNull()))
+	    json_add(document, "host", where->host[0] != '\0' ? cJSON_CreateString(where->host) : cJSON_CreateNull()) &&
+	    json_add(document, "memory", where->memory > 0 ? cJSON_CreateNumber(where->memory) : cJSON_CreateNull()) &&
+	    json_add(document, "devices",
+		     where->devices > 0 ? cJSON_CreateNumber((double)where->devices) : cJSON_CreateNull()))
 		return document;
 	cJSON_Delete(document);
 	return NULL;

@@ -88,9 +88,9 @@ cJSON *worklist_step(const char *const field[STEP_FIELD_COUNT], const char *cons
 	told = subject_json(&who);
 	for (cJSON *member; whole && told != NULL && (member = told->child) != NULL;) {
 		cJSON_DetachItemViaPointer(told, member);
-		cJSON_AddItemToObject(entry, member->string, member);
+		json_add(entry, member->string, member);
 	}
-	cJSON_AddItemToObject(entry, "not_read", not_read);
+	json_add(entry, "not_read", not_read);
 	cJSON_Delete(told);
 	if (whole)
 		return entry;

@@ -49,7 +49,7 @@ static int result_write(const struct calibrate_options *options, const struct ca
 			struct error *err)
 {
 	cJSON *document = calibration_json(calibration);
-	char *text = document != NULL ? json_print(document, NULL) : NULL;
+	char *text = json_print(document, NULL);
 	FILE *file;
 	int code = text != NULL ? output_open(options->output, &file, err)
 				: error_set(err, ERR_NO_MEMORY, "no memory for a calibration's document");

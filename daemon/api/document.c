@@ -37,7 +37,7 @@ static void add_posted(cJSON *document, const struct scan *scan)
 	cJSON_ArrayForEach(member, scan->document)
 	{
 		if (strcmp(member->string, "name") != 0)
-			cJSON_AddItemToObject(document, member->string, cJSON_Duplicate(member, true));
+			json_add(document, member->string, cJSON_Duplicate(member, true));
 	}
 }
 
@@ -62,8 +62,8 @@ static bool add_received(cJSON *document, struct stored_scan *scan, int count)
 	if (flags == NULL)
 		return false;
 	stored_scan_received(scan, flags);
-	cJSON_AddItemToObject(document, "received", json_runs(flags, count, true));
-	cJSON_AddItemToObject(document, "missing", json_runs(flags, count, false));
+	json_add(document, "received", json_runs(flags, count, true));
+	json_add(document, "missing", json_runs(flags, count, false));
 	free(flags);
 	return true;
 }
@@ -159,7 +159,7 @@ static void add_scan_warnings(cJSON *document, const struct scan *scan, const st
 			 image_kinds[i].name);
 		add_warning(warnings, "damaged_image", detail);
 	}
-	cJSON_AddItemToObject(document, "warnings", warnings);
+	json_add(document, "warnings", warnings);
 }
 
 /* Digests of what volumes are made from; of the projections null until all are there. */
@@ -168,14 +168,16 @@ static void add_digests(cJSON *document, struct stored_scan *stored, const struc
 {
 	cJSON *digests = cJSON_AddObjectToObject(document, "digests");
 	char text[DIGEST_TEXT_MAX];
-	struct error ignored;
+	struct error err = {0};
 
-	if (digest_scan(scan, text, &ignored) == 0)
+	if (digest_scan(scan, text, &err) == 0)
 		cJSON_AddStringToObject(digests, "scan", text);
-	if (facts->complete && stored_scan_digest(stored, text, &ignored) == 0)
+	json_missing_for(&err);
+	if (facts->complete && stored_scan_digest(stored, text, &err) == 0)
 		cJSON_AddStringToObject(digests, "projections", text);
 	else
 		cJSON_AddNullToObject(digests, "projections");
+	json_missing_for(&err);
 }
 
 static void add_kept_until(cJSON *document, double until)
@@ -217,14 +219,14 @@ cJSON *scan_document(struct stored_scan *stored, bool brief)
 	add_posted(document, scan);
 	if (!cJSON_HasObjectItem(document, "patient"))
 		cJSON_AddNullToObject(document, "patient");
-	cJSON_AddItemToObject(document, "axes", patient_axes_json(&scan->patient));
+	json_add(document, "axes", patient_axes_json(&scan->patient));
 	if (!add_received(document, stored, facts.count)) {
 		cJSON_Delete(document);
 		return NULL;
 	}
 	add_digests(document, stored, scan, &facts);
 	scan = stored_scan_measured(stored);
-	cJSON_AddItemToObject(document, "derived", scan_derived(scan));
+	json_add(document, "derived", scan_derived(scan));
 	add_scan_warnings(document, scan, &facts);
 	return document;
 }
@@ -384,7 +386,7 @@ static void add_job_facts(cJSON *document, struct job *job, const struct job_rec
 	add_denoising(document, record);
 	add_agreement(document, &record->agreement);
 	if (record->stop.rule != STOP_NOT)
-		cJSON_AddItemToObject(document, "stopped", stop_document(&record->stop));
+		json_add(document, "stopped", stop_document(&record->stop));
 	else
 		cJSON_AddNullToObject(document, "stopped");
 	cJSON_AddNumberToObject(document, "attempts", record->attempts);
@@ -398,7 +400,7 @@ static void add_job_facts(cJSON *document, struct job *job, const struct job_rec
 	json_add_time(document, "ended", record->ended);
 	add_timings(document, record);
 	if (record->error_code != 0)
-		cJSON_AddItemToObject(document, "error", job_error_document(record));
+		json_add(document, "error", job_error_document(record));
 	else
 		cJSON_AddNullToObject(document, "error");
 }
@@ -407,20 +409,21 @@ static void add_job_facts(cJSON *document, struct job *job, const struct job_rec
 static void add_request(cJSON *document, const struct job *job, const struct job_record *record)
 {
 	const struct job_request *asked;
-	struct error ignored;
 	cJSON *request, *member;
+	struct error err;
 
-	if (job_request(job, &asked, &ignored) != 0) {
+	if (job_request(job, &asked, &err) != 0) {
+		json_missing_for(&err);
 		cJSON_AddStringToObject(document, "scan", record->scan);
 		cJSON_AddNullToObject(document, "patient");
-		cJSON_AddItemToObject(document, "axes", patient_axes_json(&patient_unknown));
+		json_add(document, "axes", patient_axes_json(&patient_unknown));
 		return;
 	}
-	cJSON_AddItemToObject(document, "axes", patient_axes_json(&asked->patient));
+	json_add(document, "axes", patient_axes_json(&asked->patient));
 	request = job_request_json(asked);
 	while (request != NULL && (member = request->child) != NULL) {
 		cJSON_DetachItemViaPointer(request, member);
-		cJSON_AddItemToObject(document, member->string, member);
+		json_add(document, member->string, member);
 	}
 	cJSON_Delete(request);
 }

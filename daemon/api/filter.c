@@ -4,6 +4,8 @@
 #include <stdio.h>
 #include <string.h>
 
+#include "proto/json.h"
+
 enum { TEXT_MOST = 200 };
 static const char *const scan_states[] = {"receiving", "complete"};
 
@@ -174,14 +176,16 @@ static bool fits_words(struct api *api, const struct filter *filter, struct job 
 	const struct job_request *asked = NULL;
 	struct stored_scan *scan = NULL;
 	struct scan_facts named = {0};
-	struct error ignored;
+	struct error err = {0};
 	cJSON *own = NULL;
 	bool fits;
 
-	if (job_request(job, &asked, &ignored) == 0 && asked->labels != NULL)
+	if (job_request(job, &asked, &err) == 0 && asked->labels != NULL)
 		own = cJSON_Parse(asked->labels);
-	if (store_scan_find(api->store, facts->scan, &scan, &ignored) == 0)
+	json_missing_for(&err);
+	if (store_scan_find(api->store, facts->scan, &scan, &err) == 0)
 		stored_scan_facts(scan, &named);
+	json_missing_for(&err);
 	fits = filter->label == NULL || has_label(own, filter->label) || has_label(labels_of(scan), filter->label);
 	if (fits && filter->text != NULL)
 		fits = found((const char *const[]){facts->id, facts->scan, named.name, NULL}, own, filter->text) ||
@@ -207,7 +211,7 @@ bool filter_fits_scan(struct api *api, const struct filter *filter, struct store
 {
 	struct stored_scan *read = NULL;
 	struct scan_facts facts;
-	struct error ignored;
+	struct error err;
 	bool fits;
 
 	stored_scan_facts(scan, &facts);
@@ -216,8 +220,10 @@ bool filter_fits_scan(struct api *api, const struct filter *filter, struct store
 	if (filter->label == NULL && filter->text == NULL)
 		return true;
 	/* A reference of the list may have no document. */
-	if (store_scan_find(api->store, stored_scan_id(scan), &read, &ignored) != 0)
+	if (store_scan_find(api->store, stored_scan_id(scan), &read, &err) != 0) {
+		json_missing_for(&err);
 		read = NULL;
+	}
 	fits = filter->label == NULL || has_label(labels_of(read), filter->label);
 	if (fits && filter->text != NULL)
 		fits =

@@ -151,7 +151,7 @@ int projections_put(void *context, struct request *request, struct error *err)
 	cJSON_AddNumberToObject(document, "stored", outcome.created);
 	cJSON_AddNumberToObject(document, "same", outcome.same);
 	if (outcome.warnings != NULL)
-		cJSON_AddItemToObject(document, "warnings", outcome.warnings);
+		json_add(document, "warnings", outcome.warnings);
 	return request_reply_json(request, outcome.created > 0 ? 201 : 200, document, err);
 }
 

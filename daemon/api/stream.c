@@ -128,7 +128,7 @@ static int last_part(struct stream *stream)
 	size_t size = 0;
 	struct error err;
 	cJSON *document = job_document(stream->job, false, &err);
-	char *json = document != NULL ? json_print(document, &size) : NULL, *text = NULL;
+	char *json = json_print(document, &size), *text = NULL;
 	int length = -1;
 
 	cJSON_Delete(document);

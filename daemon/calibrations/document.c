@@ -7,6 +7,7 @@
 #include <string.h>
 
 #include "daemon/problem.h"
+#include "proto/json.h"
 
 const char *const calibration_state_names[] = {"queued", "running", "succeeded", "failed"};
 
@@ -29,7 +30,7 @@ static void add_copy(cJSON *document, const char *name, const cJSON *from)
 {
 	const cJSON *member = cJSON_GetObjectItemCaseSensitive(from, name);
 
-	cJSON_AddItemToObject(document, name, member != NULL ? cJSON_Duplicate(member, true) : cJSON_CreateNull());
+	json_add(document, name, member != NULL ? cJSON_Duplicate(member, true) : cJSON_CreateNull());
 }
 
 static void add_error(cJSON *document, const struct error *failure)
@@ -54,10 +55,11 @@ static bool add_sweep(cJSON *document, const cJSON *request)
 	const cJSON *posted = cJSON_GetObjectItemCaseSensitive(request, "sweep");
 	char *text = json_print(posted, NULL);
 	struct scan *scan = NULL;
-	struct error ignored;
+	struct error err = {.code = text != NULL ? 0 : ERR_NO_MEMORY};
 	cJSON *sweep, *derived;
 
-	if (text == NULL || scan_parse(text, strlen(text), &scan, &ignored) != 0) {
+	if (text == NULL || scan_parse(text, strlen(text), &scan, &err) != 0) {
+		json_missing_for(&err);
 		free(text);
 		return false;
 	}

@@ -355,7 +355,7 @@ static int read_body(const cJSON *body, char ret_scan[64], cJSON *request, struc
 		cJSON_AddStringToObject(request, "arm", arm);
 	else
 		cJSON_AddNullToObject(request, "arm");
-	cJSON_AddItemToObject(request, "phantom", cJSON_Duplicate(phantom, true));
+	json_add(request, "phantom", cJSON_Duplicate(phantom, true));
 	cJSON_AddBoolToObject(request, "adjust_balls", adjust);
 	return 0;
 }
@@ -375,7 +375,7 @@ static int add_scan(struct calibrations *calibrations, const char *id, cJSON *re
 		stored_scan_facts(scan, &facts);
 		cJSON_AddNumberToObject(request, "created", clock_realtime());
 		cJSON_AddNumberToObject(request, "acquired", facts.created);
-		cJSON_AddItemToObject(request, "sweep", cJSON_Duplicate(stored_scan_parsed(scan)->document, true));
+		json_add(request, "sweep", cJSON_Duplicate(stored_scan_parsed(scan)->document, true));
 	}
 	stored_scan_release(scan);
 	return code;

@@ -327,7 +327,7 @@ static const char *last_line(char *text)
 static void submit_job(const struct listener *listener, const char *scan, const char *key, cJSON *told)
 {
 	const cJSON *job = cJSON_GetObjectItemCaseSensitive(receive_of(listener), "job");
-	char *text = job != NULL ? json_print(job, NULL) : NULL, *arguments[ARGUMENTS_MOST] = {NULL};
+	char *text = json_print(job, NULL), *arguments[ARGUMENTS_MOST] = {NULL};
 	/* Not closed by the program that reads it. */
 	const int file = text != NULL ? memfd_create("job", 0) : -1;
 	char said[IMPORT_LINE] = "no memory for a job";

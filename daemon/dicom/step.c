@@ -147,7 +147,7 @@ static cJSON *ending(const cJSON *step, int *ret_instances)
 		put(attributes, "00400252", "COMPLETED");
 	else
 		discontinue(attributes, strcmp(state, "failed") == 0);
-	cJSON_AddItemToObject(attributes, "00400340", list);
+	json_add(attributes, "00400340", list);
 	return attributes;
 }
 

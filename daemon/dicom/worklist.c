@@ -14,7 +14,7 @@ static void found(void *context, const struct dimse_step *step)
 
 	(void)context;
 	/* One whose patient cannot be read is counted and not shown. */
-	cJSON_AddItemToObject(line, "step", entry != NULL ? entry : cJSON_CreateNull());
+	json_add(line, "step", entry != NULL ? entry : cJSON_CreateNull());
 	tell(line);
 }
 

@@ -24,6 +24,7 @@
 
 #include "daemon/lock.h"
 #include "daemon/log.h"
+#include "proto/json.h"
 
 enum {
 	/*
@@ -185,6 +186,7 @@ static enum MHD_Result on_whole(struct request *request)
 		int code;
 
 		request->wait_until = INFINITY;
+		json_set_missing(false); /* what other requests left on this thread */
 		code = request->route->handle(request->http->options.context, request, &err);
 		if (code < 0) {
 			if (reply_problem_of(request, &err) != 0)

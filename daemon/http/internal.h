@@ -121,6 +121,7 @@ struct request {
 	uint64_t response_size; /* UNKNOWN_SIZE or bytes */
 	uint64_t sent;          /* bytes, of a body that is made as it is sent */
 	bool close;             /* no further request on this connection */
+	bool header_lost;       /* of the reply, for want of memory */
 
 	double wait_until; /* for the next suspension */
 	void *state;

@@ -63,7 +63,7 @@ int request_reply_text(struct request *request, int status, const char *media_ty
 static int reply_json(struct request *request, int status, const char *media_type, cJSON *value, struct error *err)
 {
 	size_t length = 0;
-	char *text = value != NULL ? json_print(value, &length) : NULL;
+	char *text = json_print(value, &length);
 
 	cJSON_Delete(value);
 	return request_reply_text(request, status, media_type, text, length, err);
@@ -158,8 +158,8 @@ void request_reply_header(struct request *request, const char *name, const char 
 	va_start(args, format);
 	vsnprintf(value, sizeof(value), format, args);
 	va_end(args);
-	if (request->response != NULL)
-		MHD_add_response_header(request->response, name, value);
+	if (request->response != NULL && MHD_add_response_header(request->response, name, value) != MHD_YES)
+		request->header_lost = true;
 }
 
 /* ---- problems ---- */
@@ -231,7 +231,9 @@ bool reply_send(struct request *request)
 	if (request->close || atomic_load(&request->http->stopping))
 		request_reply_header(request, "Connection", "close");
 	connection_phase(request->connection, PHASE_SEND, size);
-	queued = MHD_queue_response(request->mhd, (unsigned)request->status, request->response);
+	/* Who asks again gets all of it; a reply without one of its headers may mean another thing. */
+	queued = request->header_lost ? MHD_NO
+				      : MHD_queue_response(request->mhd, (unsigned)request->status, request->response);
 	MHD_destroy_response(request->response);
 	request->response = NULL;
 	return queued == MHD_YES;

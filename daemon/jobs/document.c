@@ -18,7 +18,7 @@ cJSON *job_error_document(const struct job_record *record)
 	if (record->error_pointer[0] != '\0')
 		cJSON_AddStringToObject(document, "pointer", record->error_pointer);
 	if (report != NULL)
-		cJSON_AddItemToObject(document, "report", report);
+		json_add(document, "report", report);
 	return document;
 }
 
@@ -68,7 +68,7 @@ cJSON *sending_document(const struct sending_record *sending)
 		cJSON_AddStringToObject(document, "volume", sending->volume);
 	else
 		cJSON_AddNullToObject(document, "volume");
-	cJSON_AddItemToObject(document, "volumes", send_volumes_json(sending->volumes));
+	json_add(document, "volumes", send_volumes_json(sending->volumes));
 	cJSON_AddStringToObject(document, "state", sending_state_names[sending->state]);
 	cJSON_AddNumberToObject(document, "attempts", sending->attempts);
 	cJSON_AddNumberToObject(document, "instances", sending->instances);
@@ -123,9 +123,9 @@ cJSON *volume_document(const char *job, const struct volume_record *volume)
 	cJSON_AddStringToObject(document, "href", href);
 	cJSON_AddStringToObject(document, "stage", volume->stage);
 	cJSON_AddNumberToObject(document, "iteration", volume->iteration);
-	cJSON_AddItemToObject(document, "size", cJSON_CreateIntArray(volume->grid.size, 3));
-	cJSON_AddItemToObject(document, "spacing_mm", cJSON_CreateDoubleArray(volume->grid.spacing, 3));
-	cJSON_AddItemToObject(document, "origin_mm", cJSON_CreateDoubleArray(volume->grid.origin, 3));
+	json_add(document, "size", cJSON_CreateIntArray(volume->grid.size, 3));
+	json_add(document, "spacing_mm", cJSON_CreateDoubleArray(volume->grid.spacing, 3));
+	json_add(document, "origin_mm", cJSON_CreateDoubleArray(volume->grid.origin, 3));
 	cJSON_AddNumberToObject(document, "bytes", (double)volume->bytes);
 	if (volume->hashed) { /* of the raw float32 voxels */
 		digest_text(volume->sha256, digest);

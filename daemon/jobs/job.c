@@ -376,8 +376,8 @@ static int copy_subject(struct job_record *record, const struct scan *scan, stru
 		return 0;
 	document = subject_json(&scan->subject);
 	if (source != NULL)
-		cJSON_AddItemToObject(document, "source", cJSON_Duplicate(source, true));
-	record->subject = document == NULL ? NULL : json_print(document, NULL);
+		json_add(document, "source", cJSON_Duplicate(source, true));
+	record->subject = json_print(document, NULL);
 	cJSON_Delete(document);
 	return record->subject == NULL ? error_set_errno(err, ENOMEM, "job") : 0;
 }
@@ -388,7 +388,7 @@ static int fill_record(struct job_record *record, const struct job_request *requ
 {
 	cJSON *document = job_request_json(request);
 
-	record->request = document == NULL ? NULL : json_print(document, NULL);
+	record->request = json_print(document, NULL);
 	cJSON_Delete(document);
 	record->key = key == NULL ? NULL : strdup(key);
 	if (record->request == NULL || (key != NULL && record->key == NULL))

@@ -37,7 +37,7 @@ bool job_state_may_follow(enum job_state from, enum job_state to)
 
 int job_event_make(struct event *ret_event, const char *kind, cJSON *document, struct error *err)
 {
-	char *data = document == NULL ? NULL : json_print(document, NULL);
+	char *data = json_print(document, NULL);
 
 	cJSON_Delete(document);
 	if (data == NULL)
@@ -56,7 +56,7 @@ cJSON *job_state_document(const struct job_record *record)
 	cJSON_AddNumberToObject(document, "iteration", record->iteration);
 	cJSON_AddNumberToObject(document, "attempts", record->attempts);
 	if (record->error_code != 0)
-		cJSON_AddItemToObject(document, "error", job_error_document(record));
+		json_add(document, "error", job_error_document(record));
 	return document;
 }
 

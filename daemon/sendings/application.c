@@ -293,11 +293,11 @@ char *application_task(const struct sendings *sendings, int transfer)
 	if (task == NULL)
 		return NULL;
 	copy = cJSON_Duplicate(row, true);
-	cJSON_AddItemToObject(task, listens ? "listen" : "worklist", copy);
 	if (listens) {
 		snprintf(directory, sizeof(directory), "%s/received", store_directory(sendings->store));
 		cJSON_AddStringToObject(copy, "directory", directory);
 	}
+	json_add(task, listens ? "listen" : "worklist", copy);
 	text = json_print(task, NULL);
 	cJSON_Delete(task);
 	if (text == NULL || asprintf(&line, "%s\n", text) < 0)
@@ -446,8 +446,8 @@ cJSON *worklist_document(struct sendings *sendings)
 	const struct worklist *worklist = &sendings->worklist;
 
 	pthread_mutex_lock(&sendings->lock);
-	cJSON_AddItemToObject(document, "steps",
-			      worklist->steps != NULL ? cJSON_Duplicate(worklist->steps, true) : cJSON_CreateArray());
+	json_add(document, "steps",
+		 worklist->steps != NULL ? cJSON_Duplicate(worklist->steps, true) : cJSON_CreateArray());
 	cJSON_AddNumberToObject(document, "not_shown", worklist->nobodys);
 	json_add_time(document, "checked", worklist->checked);
 	if (worklist->wanted)

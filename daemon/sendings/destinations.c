@@ -67,7 +67,7 @@ static void read_rule(struct json_reader *reader, char ret_rule[SEND_VOLUMES_SIZ
 		return;
 	wanted = cJSON_CreateObject();
 	cJSON_AddStringToObject(wanted, "to", "rule");
-	cJSON_AddItemToObject(wanted, "volumes", cJSON_Duplicate(value, true));
+	json_add(wanted, "volumes", cJSON_Duplicate(value, true));
 	if (send_wish_read(wanted, "", &wish, reader->err) != 0)
 		json_fail(reader, ERR_INVALID, "send",
 			  "expected \"none\", \"last\", \"all\" or a list of iterations, \"fdk\" and \"fdk-tv\"");
@@ -297,8 +297,7 @@ static cJSON *document_of(const struct sendings *sendings, const struct destinat
 		cJSON_AddStringToObject(document, "objects", dicom_kind_names[one->objects]);
 	else
 		cJSON_AddNullToObject(document, "objects");
-	cJSON_AddItemToObject(document, "send",
-			      one->rule[0] != '\0' ? send_volumes_json(one->rule) : cJSON_CreateString("none"));
+	json_add(document, "send", one->rule[0] != '\0' ? send_volumes_json(one->rule) : cJSON_CreateString("none"));
 	if (one->known)
 		cJSON_AddBoolToObject(document, "reachable", one->reachable);
 	else

@@ -154,7 +154,7 @@ int step_task_make(struct sendings *sendings, const struct destination *destinat
 	dicom_step_uid(record.id, uid);
 	task_add_destination(sendings, task, destination);
 	if (record.subject != NULL)
-		cJSON_AddItemToObject(task, "subject", cJSON_Parse(record.subject));
+		json_add(task, "subject", cJSON_Parse(record.subject));
 	cJSON_AddStringToObject(step, "uid", uid);
 	cJSON_AddStringToObject(step, "id", record.id);
 	cJSON_AddNumberToObject(step, "begun", record.created);

@@ -29,7 +29,7 @@ static int find_volume(struct sendings *sendings, const char *job, const char *n
 static void add_subject(cJSON *task, const struct job_record *record)
 {
 	if (record->subject != NULL)
-		cJSON_AddItemToObject(task, "subject", cJSON_Parse(record->subject));
+		json_add(task, "subject", cJSON_Parse(record->subject));
 }
 
 int task_add_volume(struct sendings *sendings, cJSON *task, struct job *job, const char *name, bool verify,
@@ -55,9 +55,9 @@ int task_add_volume(struct sendings *sendings, cJSON *task, struct job *job, con
 	cJSON_AddNumberToObject(task, "created", volume.created);
 	cJSON_AddNumberToObject(task, "mu_water", record.mu_water);
 	grid = cJSON_AddObjectToObject(task, "grid");
-	cJSON_AddItemToObject(grid, "size", cJSON_CreateIntArray(volume.grid.size, 3));
-	cJSON_AddItemToObject(grid, "spacing_mm", cJSON_CreateDoubleArray(volume.grid.spacing, 3));
-	cJSON_AddItemToObject(grid, "origin_mm", cJSON_CreateDoubleArray(volume.grid.origin, 3));
+	json_add(grid, "size", cJSON_CreateIntArray(volume.grid.size, 3));
+	json_add(grid, "spacing_mm", cJSON_CreateDoubleArray(volume.grid.spacing, 3));
+	json_add(grid, "origin_mm", cJSON_CreateDoubleArray(volume.grid.origin, 3));
 	add_subject(task, &record);
 	return 0;
 }
@@ -67,7 +67,7 @@ void task_add_destination(const struct sendings *sendings, cJSON *task, const st
 	cJSON *row = cJSON_Duplicate(destination->row, true);
 
 	cJSON_AddStringToObject(row, "own_title", sendings->application.title);
-	cJSON_AddItemToObject(task, "destination", row);
+	json_add(task, "destination", row);
 }
 
 int task_line(cJSON *task, char **ret_line, struct error *err)

@@ -165,7 +165,7 @@ int store_sweep_jobs(struct store *store, struct error *err)
 	struct sweep sweep = {.store = store};
 	struct job_record *jobs = NULL;
 	char path[1024];
-	int code = catalogue_list(store->catalogue, NULL, &jobs, &sweep.job_count, err);
+	int ended, code = catalogue_list(store->catalogue, NULL, &jobs, &sweep.job_count, err);
 
 	/* All rows are read as of one moment, which saves a start with many jobs much time: none changes before it is
 	 * read. */
@@ -175,7 +175,10 @@ int store_sweep_jobs(struct store *store, struct error *err)
 		sweep.jobs = jobs;
 		snprintf(path, sizeof(path), "%s/jobs", store->directory);
 		code = directory_visit(path, sweep_directory, &sweep, err);
-		catalogue_freeze(store->catalogue, false, code == 0 ? err : &(struct error){0});
+		/* Who goes on with what was frozen never sees what is written after it. */
+		ended = catalogue_freeze(store->catalogue, false, code == 0 ? err : &(struct error){0});
+		if (code == 0)
+			code = ended;
 	}
 	job_records_free(jobs, sweep.job_count);
 	return code;

@@ -48,12 +48,10 @@ static int record_text(struct store *store, enum record_kind kind, const char *i
 	if (code != 0 || rows == NULL)
 		return code;
 	record = cJSON_CreateObject();
-	if (cJSON_AddStringToObject(record, "kind", record_words[kind].kind) != NULL &&
-	    cJSON_AddStringToObject(record, "id", id) != NULL && cJSON_AddItemToObject(record, "rows", rows)) {
-		rows = NULL;
-		body = json_print(record, &length);
-	}
-	cJSON_Delete(rows);
+	cJSON_AddStringToObject(record, "kind", record_words[kind].kind);
+	cJSON_AddStringToObject(record, "id", id);
+	json_add(record, "rows", rows);
+	body = json_print(record, &length);
 	cJSON_Delete(record);
 	text = body == NULL ? NULL : malloc(FIRST_LINE + length + 2);
 	/* The body's own brace goes: the checksum is its first member. */

@@ -305,8 +305,7 @@ cJSON *json_of_row(const struct table *table, const struct value *values)
 			cJSON *member = json_of_value(values);
 
 			/* A row that lacks a column would be read with that column's default. */
-			if (!cJSON_AddItemToObject(object, column->name, member)) {
-				cJSON_Delete(member);
+			if (!json_add(object, column->name, member)) {
 				cJSON_Delete(object);
 				return NULL;
 			}

@@ -1,15 +1,13 @@
 /*
  * The catalogue as one SQLite database in WAL mode, STATE/catalogue.sqlite.
  *
- * Every commit is synced (synchronous = FULL): one append to the log and one
- * fdatasync; but for projections, whose records beside the samples are synced
- * (store/sums.c). The log is moved into the database by a thread of its own, so that
- * no commit waits for most of that. One connection writes, another reads and never
- * waits for the writer. Every page is checked as it is read (store/checksum_vfs.h).
+ * Every commit is synced (synchronous = FULL): one append to the log and one fdatasync; but for projections, whose
+ * records beside the samples are synced (store/sums.c). The log is moved into the database by a thread of its own, so
+ * that no commit waits for most of that. One connection writes, another reads and never waits for the writer. Every
+ * page is checked as it is read (store/checksum_vfs.h).
  *
- * The catalogue is this process's own: the index of its log (-shm) is mapped memory
- * that nothing checks, so its file loses its name as soon as it is open. Another
- * program must not write into the catalogue of a running daemon.
+ * The catalogue is this process's own: the index of its log (-shm) is mapped memory that nothing checks, so its file
+ * loses its name as soon as it is open. Another program must not write into the catalogue of a running daemon.
  */
 #include <assert.h>
 #include <errno.h>
@@ -289,13 +287,16 @@ static int run_script(void *opened, const char *sql, struct error *err)
 static int begin(void *opened, bool synced, struct error *err)
 {
 	struct database *database = opened;
+	struct connection *writer = &database->connections[SESSION_WRITER];
+	/* There may have been no memory for a ROLLBACK. */
+	int code = sqlite3_get_autocommit(writer->db) ? 0 : execute(writer, "ROLLBACK", err);
 
-	/* How commits reach the disk can be set between transactions only. */
-	if (database->unsynced == synced)
-		sqlite3_exec(database->connections[SESSION_WRITER].db,
-			     synced ? "PRAGMA synchronous = FULL" : "PRAGMA synchronous = NORMAL", NULL, NULL, NULL);
-	database->unsynced = !synced;
-	return run(database, SESSION_WRITER, "BEGIN IMMEDIATE", NULL, 0, NULL, NULL, err);
+	/* How commits reach the disk can be set between transactions only. Where that failed it may be either. */
+	if (code == 0 && database->unsynced == synced) {
+		code = execute(writer, synced ? "PRAGMA synchronous = FULL" : "PRAGMA synchronous = NORMAL", err);
+		database->unsynced = code != 0 || !synced;
+	}
+	return code != 0 ? code : run(database, SESSION_WRITER, "BEGIN IMMEDIATE", NULL, 0, NULL, NULL, err);
 }
 
 static int end(void *opened, bool commit, struct error *err)

@@ -83,8 +83,8 @@ int catalogue_upgrade_job(cJSON *row, struct error *err)
 		if (!came_from_array(&jobs->columns[i]))
 			continue;
 		code = row_of_column(&jobs->columns[i], &job, &values, err);
-		if (code == 0)
-			cJSON_AddItemToObject(row, jobs->columns[i].name, json_of_value(&values.values[0]));
+		if (code == 0 && !json_add(row, jobs->columns[i].name, json_of_value(&values.values[0])))
+			code = error_set_errno(err, ENOMEM, "a row of the catalogue");
 		row_clear(&values);
 	}
 	return code;

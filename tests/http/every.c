@@ -3,11 +3,13 @@
  *
  *   PROGRAM CALL N KIND FILE
  *
- * and the N-th CALL (write, pwrite, fsync, fdatasync, rename, link, mmap, fallocate, open, read, pread, accept, malloc,
- * send, recv; each stands for all calls of its kind, open for openat, malloc for calloc and realloc)
- * of a process of PROGRAM ("cbctd", "cbct-worker"; the held ones too) fails, once: KIND is an error number, or "short"
- * for half of the bytes. FILE.fired is made then, and while it is there no other process fails. FILE.count grows by a
- * byte for each call of the program that N would count. The C library's own calls (stdio) are not seen.
+ * and the N-th CALL (write, pwrite, fsync, fdatasync, rename, link, mmap, fallocate, open, read, pread, accept,
+ * malloc, send, recv; each stands for all calls of its kind, open for openat, malloc for calloc and realloc) of a
+ * process of PROGRAM ("cbctd", "cbct-worker"; the held ones too) fails, once: KIND is an error number, or "short" for
+ * half of the bytes. FILE.fired is made then, with the path of the program or library that called, and while it is
+ * there no other process fails. FILE.count grows by a byte for each call of the program that N would count, where N is
+ * 0. FILE.left gets a line of each process that ends with status 0: blocks of memory and descriptors that are left.
+ * The C library's own calls (stdio) are not seen.
  */
 #define _GNU_SOURCE
 #include <dlfcn.h>
@@ -29,12 +31,33 @@
 extern void *__libc_malloc(size_t size);
 extern void *__libc_calloc(size_t count, size_t size);
 extern void *__libc_realloc(void *memory, size_t size);
+extern void *__libc_memalign(size_t alignment, size_t size);
+extern void __libc_free(void *memory);
 
-static char wanted[32], fired[600];
+static char wanted[32], fired[600], left_path[600];
 static long number;
 static int error_number; /* 0: short */
 static int counter = -1; /* descriptor of FILE.count */
 static atomic_long calls;
+static atomic_long live; /* blocks that are allocated and not freed */
+
+/* What is left at the end of a process that ends as it should: blocks of memory, and descriptors. */
+static void tell(int status, void *nothing)
+{
+	char line[64];
+	struct stat file;
+	int i, files = 0, length, left;
+
+	(void)nothing;
+	if (status != 0)
+		return;
+	for (i = 0; i < 1024; i++)
+		files += fstat(i, &file) == 0;
+	length = snprintf(line, sizeof(line), "%ld %d\n", atomic_load(&live), files);
+	left = (int)syscall(SYS_openat, AT_FDCWD, left_path, O_WRONLY | O_CREAT | O_APPEND | O_CLOEXEC, 0600);
+	if (left >= 0)
+		syscall(SYS_write, left, line, (size_t)length);
+}
 
 __attribute__((constructor)) static void arm(void)
 {
@@ -49,13 +72,16 @@ __attribute__((constructor)) static void arm(void)
 	error_number = atoi(kind);
 	snprintf(fired, sizeof(fired), "%s.fired", file);
 	snprintf(count, sizeof(count), "%s.count", file);
+	snprintf(left_path, sizeof(left_path), "%s.left", file);
 	counter = (int)syscall(SYS_openat, AT_FDCWD, count, O_WRONLY | O_CREAT | O_APPEND | O_CLOEXEC, 0600);
+	on_exit(tell, NULL);
 }
 
 /* Counts a call; true when this is the one. Nothing here goes through what is wrapped. */
-static bool is_it(const char *call)
+static bool is_it_of(const char *call, void *caller)
 {
 	int saved = errno;
+	Dl_info where;
 	long file;
 
 	if (wanted[0] == '\0' || strcmp(call, wanted) != 0)
@@ -67,11 +93,16 @@ static bool is_it(const char *call)
 		return false;
 	}
 	file = syscall(SYS_openat, AT_FDCWD, fired, O_WRONLY | O_CREAT | O_EXCL | O_CLOEXEC, 0600);
-	if (file >= 0)
+	if (file >= 0) {
+		if (dladdr(caller, &where) != 0 && where.dli_fname != NULL)
+			syscall(SYS_write, (int)file, where.dli_fname, strlen(where.dli_fname));
 		syscall(SYS_close, (int)file);
+	}
 	errno = saved;
 	return file >= 0;
 }
+
+#define is_it(call) is_it_of(call, __builtin_return_address(0))
 
 /*
  * A file or a socket. Writes to an eventfd or to a pipe that the same process reads, which wake a thread, do not fail
@@ -298,29 +329,68 @@ int openat(int folder, const char *path, int flags, ...)
 
 /* ---- memory ---- */
 
+static void *counted(void *memory)
+{
+	if (memory != NULL)
+		atomic_fetch_add_explicit(&live, 1, memory_order_relaxed);
+	return memory;
+}
+
+static bool no_memory(void *caller)
+{
+	if (!is_it_of("malloc", caller))
+		return false;
+	errno = ENOMEM;
+	return true;
+}
+
 void *malloc(size_t size)
 {
-	if (is_it("malloc")) {
-		errno = ENOMEM;
-		return NULL;
-	}
-	return __libc_malloc(size);
+	return no_memory(__builtin_return_address(0)) ? NULL : counted(__libc_malloc(size));
 }
 
 void *calloc(size_t count, size_t size)
 {
-	if (is_it("malloc")) {
-		errno = ENOMEM;
-		return NULL;
-	}
-	return __libc_calloc(count, size);
+	return no_memory(__builtin_return_address(0)) ? NULL : counted(__libc_calloc(count, size));
+}
+
+void free(void *memory)
+{
+	if (memory != NULL)
+		atomic_fetch_sub_explicit(&live, 1, memory_order_relaxed);
+	__libc_free(memory);
 }
 
 void *realloc(void *memory, size_t size)
 {
-	if (is_it("malloc")) {
-		errno = ENOMEM;
+	void *moved;
+
+	if (no_memory(__builtin_return_address(0)))
 		return NULL;
-	}
-	return __libc_realloc(memory, size);
+	moved = __libc_realloc(memory, size);
+	if (memory == NULL)
+		counted(moved);
+	else if (moved == NULL && size == 0) /* That freed it. */
+		atomic_fetch_sub_explicit(&live, 1, memory_order_relaxed);
+	return moved;
+}
+
+void *aligned_alloc(size_t alignment, size_t size)
+{
+	return no_memory(__builtin_return_address(0)) ? NULL : counted(__libc_memalign(alignment, size));
+}
+
+void *memalign(size_t alignment, size_t size)
+{
+	return aligned_alloc(alignment, size);
+}
+
+int posix_memalign(void **ret_memory, size_t alignment, size_t size)
+{
+	void *memory = aligned_alloc(alignment, size);
+
+	if (memory == NULL)
+		return ENOMEM;
+	*ret_memory = memory;
+	return 0;
 }

@@ -310,6 +310,34 @@ START_TEST(print_is_always_json)
 }
 END_TEST
 
+/* A tree of which something is missing is not printed, once; tests/http/every.py has memory run out everywhere. */
+START_TEST(print_refuses_a_tree_that_lacks_something)
+{
+	struct error err = {.code = ERR_NO_MEMORY};
+	cJSON *value = cJSON_CreateObject(), *back;
+	char *text;
+
+	ck_assert(json_add(value, "here", cJSON_CreateTrue()));
+	ck_assert(!json_add(value, "no value", NULL));
+	ck_assert(!json_add(NULL, "deleted", cJSON_CreateTrue()));
+	json_missing_for(&err);
+	ck_assert_ptr_null(json_print(value, NULL));
+	text = json_print(value, NULL);
+	ck_assert_str_eq(text, "{\"here\":true}");
+	free(text);
+	ck_assert_ptr_null(json_print(NULL, NULL));
+
+	json_set_missing(true);
+	back = parsed("{}");
+	cJSON_Delete(back);
+	ck_assert(json_set_missing(false));
+	err.code = ERR_INVALID;
+	json_missing_for(&err);
+	ck_assert(!json_set_missing(false));
+	cJSON_Delete(value);
+}
+END_TEST
+
 /* ---- the reader ---- */
 
 struct answers {
@@ -486,6 +514,7 @@ Suite *json_suite(void)
 	tcase_add_test(texts, many_names_are_compared_in_good_time);
 	tcase_add_test(texts, every_finite_double_comes_back_the_same);
 	tcase_add_test(texts, print_is_always_json);
+	tcase_add_test(texts, print_refuses_a_tree_that_lacks_something);
 	suite_add_tcase(suite, texts);
 	tcase_add_test(reader, reader_fills_what_is_there_and_leaves_the_rest);
 	tcase_add_test(reader, reader_refuses_by_pointer);
