@@ -291,11 +291,11 @@ demo: setup ## a C-arm scan posted with curl, reconstructed, its volumes coming 
 
 check: setup ## every test; what cannot run here is skipped aloud
 	@$(MAKE) --no-print-directory -j$$(nproc) all test-programs
-	@BUILD=$(BUILD) SANITIZED=$(SANITIZED) LEAVE_OUT="$(LEAVE_OUT)" OMP_WAIT_POLICY=passive tests/run.sh
+	@BUILD=$(BUILD) SANITIZED=$(SANITIZED) LEAVE_OUT="$(LEAVE_OUT)" tests/run.sh
 
 soak: setup ## the long tests: faults by the thousand, sweeps over anatomy and noise (an hour and more)
 	@$(MAKE) --no-print-directory -j$$(nproc) all test-programs
-	@BUILD=$(BUILD) OMP_WAIT_POLICY=passive tests/run.sh --soak
+	@BUILD=$(BUILD) tests/run.sh --soak
 
 FUZZ_SECONDS ?= 10
 fuzzers := $(patsubst tests/fuzz/%.c,$(BUILD)/%,$(wildcard tests/fuzz/fuzz_*.c))

@@ -7,6 +7,8 @@
 set -uo pipefail
 cd "$(dirname "$0")/.."
 export BUILD=${BUILD:-build}
+# Parts share the processors: threads that wait for others of theirs leave them to the rest, at once.
+export OMP_WAIT_POLICY=${OMP_WAIT_POLICY:-passive}
 processors=$(nproc)
 JOBS=${JOBS:-$((processors + 3))}
 out=$BUILD/test/parts
