@@ -57,7 +57,8 @@ struct recipe {
 	struct {
 		bool geometry, motion; /* one of them at most: how views are moved to fit (core/refine/refine.h) */
 	} refine;
-	int binning; /* pixels a side that are taken as one (core/correct/binning.h); BINNING_AUTO until resolved */
+	bool keep_all; /* not asked for: all projections are kept, so that spoiled ones can be mended (recon_lacks) */
+	int binning;   /* pixels a side that are taken as one (core/correct/binning.h); BINNING_AUTO until resolved */
 	struct {
 		bool on; /* needs fdk.on */
 		double threshold_hu;

@@ -129,6 +129,8 @@ const struct warning_kind warning_kinds[] = {
      "Some projections lie aside of the others, as when the patient or the arm moves; they were left out where that "
      "was "
      "possible."},
+    {"spoiled_views", SEVERITY_SERIOUS,
+     "Spoiled projections could neither be corrected nor left out: the image may be wrong."},
     {"no_object", SEVERITY_SERIOUS, "No projection shows anything: the image is empty."},
     {"air_region", SEVERITY_CAUTION, "The brightness of air changed during the scan, and was corrected."},
     {"air_level", SEVERITY_CAUTION,

@@ -404,6 +404,7 @@ struct reconstruction {
 	float *errors, *flat;  /* of pixels' gain, and the image that has them; NULL where there are none */
 	bool looked;           /* what is asked of all views for their pixels is known */
 	bool refined;          /* what is asked of all views for their poses is known */
+	bool keeps_all;        /* all projections are kept, so that spoiled ones can be mended */
 	struct geometry poses; /* that were found, owned; no views: the scan's own */
 };
 
@@ -542,6 +543,7 @@ static int open_recon(struct reconstruction *reconstruction, struct error *err)
 
 	if (reconstruction->refined)
 		recipe.refine.geometry = recipe.refine.motion = false;
+	recipe.keep_all = reconstruction->keeps_all;
 	code = recon_open(reconstruction->backend, reconstruction->device, geometry, &reconstruction->linearise,
 			  &recipe, &reconstruction->hooks, &reconstruction->recon, err);
 	reconstruction->run.recon = reconstruction->recon;
@@ -717,6 +719,25 @@ static int heed_poses(struct reconstruction *reconstruction, bool *ret_again, st
 	if (!reconstruction->resumed)
 		tell_refinement(reconstruction, &refinement);
 	return *ret_again ? open_again(reconstruction, err) : 0;
+}
+
+/*
+ * Called once all projections have been pushed, and their pixels and poses heeded. Where views are spoiled which can be
+ * mended only if all projections are kept, the reconstruction is opened anew and keeps them, *ret_again. Without the
+ * memory for that they stay as they are, which is told.
+ */
+static int heed_spoiled(struct reconstruction *reconstruction, bool *ret_again, struct error *err)
+{
+	int code = recon_lacks(reconstruction->recon, ret_again, err);
+
+	if (code < 0 || !*ret_again)
+		return code;
+	reconstruction->keeps_all = true;
+	code = open_again(reconstruction, err);
+	if (code != ERR_NO_MEMORY)
+		return code;
+	reconstruction->keeps_all = false;
+	return open_again(reconstruction, err);
 }
 
 /* Sets the provenance in the volumes' files, but for stage and iteration. */
@@ -1099,6 +1120,11 @@ int reconstruction_finish(struct reconstruction *reconstruction, struct error *e
 		code = heed_poses(reconstruction, &again, err);
 	else
 		again = false;
+	if (code == 0 && again)
+		code = reconstruction_push_rest(reconstruction, err);
+	again = false;
+	if (code == 0 && reconstruction->pushed == reconstruction_wanted(reconstruction))
+		code = heed_spoiled(reconstruction, &again, err);
 	if (code == 0 && again)
 		code = reconstruction_push_rest(reconstruction, err);
 	if (code == 0)

@@ -10,6 +10,9 @@
 #include "core/correct/input.h"
 #include "core/refine/agreement.h"
 
+/* Less than this is nothing that is worth a number. */
+static const double UNSEEN_MM = 0.005;
+
 struct state {
 	struct reduced reduced;
 	float *view; /* [row][column] of the scan, on its way into bins */
@@ -117,6 +120,14 @@ static void tell(const struct correction_job *job, const struct agreement *agree
 
 	if (grade == AGREEMENT_GOOD || tell_opposite(job, &agreement->rays, bin))
 		return;
+	if (agreement->mm < UNSEEN_MM) {
+		warning_tell(job->warnings, "geometry_wrong",
+			     "%.0f %% of a view's detail is not where the others show it (median of %d views), and no "
+			     "shift of the views explains that: what some views show may be wrong, or the geometry be "
+			     "off by much",
+			     100 * agreement->unexplained, agreement->measured);
+		return;
+	}
 	warning_tell(job->warnings, grade == AGREEMENT_WRONG ? "geometry_wrong" : "geometry_doubtful",
 		     "views lie aside of what the others show by %.2g mm at the isocentre (root mean square over %d "
 		     "views; %.2g mm "

@@ -123,12 +123,24 @@ static struct outlier_report report_of(const struct input *input, int views, enu
 	return report;
 }
 
-/* Outliers can be left out all, or where no projections are kept some of them. Those between two steps are mended. */
+/* Where no projections are kept, and there is no memory for it, some spoiled views go into the image as they are. */
+static void warn_of_kept(const struct input *input, int views, const struct warning_sink *sink)
+{
+	const int kept = input_kept_in(input, views);
+
+	if (kept > 0)
+		warning_tell(sink, "spoiled_views",
+			     "%d projections, %.2g %% of all, are in the image as they are, though they do not follow "
+			     "those beside them: FDK alone keeps up to %d projections to leave them out, and there is "
+			     "no memory to keep all of them",
+			     kept, 100.0 * kept / views, COPIES_MOST);
+}
+
+/* Those between two steps are mended, the others left out. */
 static void warn_of_outliers(const struct input *input, int views, const struct warning_sink *sink)
 {
 	struct outlier_report reports[OUTLIER_KINDS];
-	const char *done;
-	char parts[96];
+	char done[96], parts[96];
 	int count = 0;
 
 	for (int kind = OUTLIER_DARK; kind < OUTLIER_KINDS; kind++) {
@@ -137,9 +149,10 @@ static void warn_of_outliers(const struct input *input, int views, const struct 
 	}
 	snprintf(parts, sizeof(parts), "Opposite rays stand in for %.0f %% of that, the views beside for the rest",
 		 100 * input->opposite);
-	done = input->left_out == count ? "They are left out, the others stand in for them"
-	       : 3 * count > views      ? "They are too many to be left out"
-					: "Not all of them could be left out: FDK alone keeps no projections";
+	if (input->left_out == count)
+		snprintf(done, sizeof(done), "They are left out, the others stand in for them");
+	else
+		snprintf(done, sizeof(done), "%d of them and of other such ones are left out", input->left_out);
 	if (reports[OUTLIER_DARK].count > 0)
 		warning_tell(sink, "dark_parts",
 			     "%d projections, the first of them is %d, have parts without a usable sample, or with "
@@ -180,6 +193,7 @@ static int warn(const struct correction_job *job, void *state, struct error *err
 	for (int i = 0; i < nothing; i++)
 		first = input->blank[i] < first ? input->blank[i] : first;
 	warn_of_outliers(input, job->geometry->count, job->warnings);
+	warn_of_kept(input, job->geometry->count, job->warnings);
 	if (empty > 0)
 		warning_tell(job->warnings, "blank_views",
 			     "%d projections show nothing, the first of them is %d: %d have no good pixel, and %d one "

@@ -574,6 +574,24 @@ int input_settle(struct input *input, const struct orbit *orbit, bool keeps_all,
 	return code < 0 ? code : found + code;
 }
 
+int input_kept_in(const struct input *input, int views)
+{
+	int count = -input->left_out;
+
+	for (int view = 0; view < views; view++)
+		count += input->outliers[view].kind != OUTLIER_NONE && !input_is_mended(input, view);
+	return count;
+}
+
+bool input_lacks(const struct input *input, int views)
+{
+	bool lacks = input_kept_in(input, views) > 0;
+
+	for (int view = 0; view < views; view++)
+		lacks = lacks || (input->steps[view].kind == STEP_PART && !input_is_mended(input, view));
+	return lacks;
+}
+
 /* Takes a level off the copy of a view. */
 static void take_off_copy(struct input *input, int view, float level)
 {

@@ -123,6 +123,12 @@ bool input_is_mended(const struct input *input, int view);
  */
 int input_settle(struct input *input, const struct orbit *orbit, bool keeps_all, struct error *err);
 
+/* Behind input_settle of a job that keeps no projections: whether there are views that it could mend, or leave out, if
+ * it did. */
+bool input_lacks(const struct input *input, int views);
+/* Outliers that are neither mended nor left out. */
+int input_kept_in(const struct input *input, int views);
+
 /*
  * Makes the views that are to be mended whole in `projections`, which keeps all views where keeps_all; otherwise the
  * levels alone are to be taken off the copies.

@@ -59,8 +59,9 @@ struct recon {
 	struct volume_noise noise; /* where it is measured */
 	bool noise_measured;
 
-	bool resumed, ran, ended; /* ended: behind the last iteration */
-	int iteration;            /* done so far */
+	bool resumed, looked, ran, ended; /* looked: behind input_settle; ended: behind the last iteration */
+	int left_out;                     /* views that input_settle has found */
+	int iteration;                    /* done so far */
 	struct recon_agreement agreement;
 	double settled; /* iterations after which relaxation falls; INFINITY: never */
 	bool moved;     /* the iterate is not the one that the algorithm left */

@@ -19,7 +19,8 @@ bool keeps_projections(const struct recipe *recipe)
 {
 	const struct linearise none = {.sample = SAMPLE_FLOAT32};
 
-	return recipe->algorithm != NULL || recipe->hold_out || corrections_need(recipe, &none, NEEDS_ALL_VIEWS);
+	return recipe->algorithm != NULL || recipe->hold_out || recipe->keep_all ||
+	       corrections_need(recipe, &none, NEEDS_ALL_VIEWS);
 }
 
 bool has_subsets(const struct recipe *recipe)

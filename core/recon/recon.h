@@ -130,6 +130,12 @@ int recon_push(struct recon *recon, const void *samples, const int *views, int c
 int recon_refine(struct recon *recon, struct refinement *ret_refinement, struct geometry *ret_geometry,
 		 struct error *err);
 
+/*
+ * After the last view, before recon_run: whether there are spoiled views which could be made whole, or left out, if all
+ * projections were kept: by a reconstruction opened anew with recipe.keep_all.
+ */
+int recon_lacks(struct recon *recon, bool *ret_lacks, struct error *err);
+
 /* Called once, after the last view: finishes FDK, then TV, iterations and TV in turn, calling the hooks. */
 int recon_run(struct recon *recon, struct error *err);
 

@@ -353,16 +353,29 @@ static int hold_out(struct recon *recon, struct error *err)
 	return empty_slots(recon, views, count, err);
 }
 
+/* Once all views have come, and once at all: finds those that show nothing, and spoiled ones. */
+static int settle(struct recon *recon, struct error *err)
+{
+	const int found =
+	    recon->looked ? 0 : input_settle(&recon->input, &recon->orbit, keeps_projections(&recon->recipe), err);
+
+	if (found < 0 || recon->looked)
+		return found;
+	recon->looked = true;
+	recon->left_out = found;
+	return 0;
+}
+
 /* Once all views have come: those that show nothing, and outliers, are left out of the FDK volume, and their slots say
  * nothing; so do those of views that are held out. */
 static int leave_out(struct recon *recon, struct error *err)
 {
 	struct input *input = &recon->input;
 	const bool keeps = keeps_projections(&recon->recipe);
-	const int found = input_settle(input, &recon->orbit, keeps, err);
-	const int *views = input->blank + input->counts.blank - (found > 0 ? found : 0);
-	const int mended = input->mended_count;
-	int *spoiled = NULL, code = found < 0 ? found : 0;
+	int code = settle(recon, err);
+	const int found = recon->left_out, mended = input->mended_count;
+	const int *views = input->blank + input->counts.blank - found;
+	int *spoiled = NULL;
 
 	if (code == 0 && found + mended > 0 && recon_runs_fdk(recon)) {
 		spoiled = malloc((size_t)(found + mended) * sizeof(*spoiled));
@@ -588,6 +601,17 @@ static int check_complete(const struct recon *recon, struct error *err)
 		view++;
 	return error_set(err, ERR_CONFLICT, "%d of %d views have not come, the first of them is %d",
 			 all - recon->pushed_count, all, view);
+}
+
+int recon_lacks(struct recon *recon, bool *ret_lacks, struct error *err)
+{
+	int code = check_complete(recon, err);
+
+	if (code == 0)
+		code = settle(recon, err);
+	if (code == 0)
+		*ret_lacks = !keeps_projections(&recon->recipe) && input_lacks(&recon->input, recon->geometry->count);
+	return code;
 }
 
 int recon_run(struct recon *recon, struct error *err)

@@ -99,6 +99,21 @@ test_views_between_two_steps_are_made_whole() {
 	done
 }
 
+# A job of FDK alone keeps no projections, and does as well: all of them are kept once it is known that views are spoiled.
+test_fdk_alone_makes_views_whole() {
+	local row name code told
+	reconstruct "$work/dense" "{\"scan\": \"SCAN\", $grid, \"fdk\": {}}"
+	get_volume final "$work/fdk.nii"
+	for row in 'part dark_parts ^12' 'dose dose_steps ^30' 'band dark_parts ^20' 'aside shifted_views ^15'; do
+		read -r name code told <<<"$row"
+		reconstruct "$work/$name" "{\"scan\": \"SCAN\", $grid, \"fdk\": {}}"
+		expect_json "[.warnings[] | select(.code == \"$code\") | .detail | test(\"$told projections, the first of them is 50,\")] == [true]"
+		expect_json '.warnings | all(.code != "spoiled_views")'
+		get_volume final "$work/$name.nii"
+		expect_number "$(cbct compare --json "$work/$name.nii" "$work/fdk.nii" | jq '.rmse / 0.0192 * 1000')" '<' "$([ "$name" = aside ] && echo 30 || echo 5)" "$name: RMSE in HU"
+	done
+}
+
 # Fifteen of 120 views that lie five columns aside.
 test_a_run_of_views_aside_is_told_and_left_out() {
 	reconstruct "$work/aside" "{\"scan\": \"SCAN\", $grid}"

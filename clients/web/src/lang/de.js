@@ -534,6 +534,7 @@ export const strings = {
 	'Some projections are copies of the ones before them, and were left out where that was possible.': 'Einige Projektionen sind Kopien der vorigen und blieben weg, wo das möglich war.',
 	'Some projections were taken with another dose than those beside them, and were corrected or left out where that was possible.': 'Einige Projektionen haben eine andere Dosis als die daneben; das wurde korrigiert, oder sie blieben weg, wo das möglich war.',
 	'Some projections lie aside of the others, as when the patient or the arm moves; they were left out where that was possible.': 'Einige Projektionen liegen neben den anderen, wie wenn Patient oder Bogen sich bewegen; sie blieben weg, wo das möglich war.',
+	'Spoiled projections could neither be corrected nor left out: the image may be wrong.': 'Gestörte Projektionen ließen sich weder korrigieren noch weglassen: Das Bild kann falsch sein.',
 	'No projection shows anything: the image is empty.': 'Keine Projektion zeigt etwas: Das Bild ist leer.',
 	'The brightness of air changed during the scan, and was corrected.': 'Die Helligkeit der Luft änderte sich während des Scans und wurde korrigiert.',
 	'Air is darker or brighter in some projections than it should be: gray values may be off.': 'Luft ist in einigen Projektionen dunkler oder heller, als sie sein sollte: Grauwerte können abweichen.',
