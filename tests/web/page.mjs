@@ -143,6 +143,24 @@ test('the list stands by state, says what tells jobs of a scan apart and how lon
 	await page.context().close()
 })
 
+test('of many scans the newest are shown, and the others where one asks for them', async () => {
+	const plain = { detector: { columns: 4, rows: 4, pixel_mm: [1, 1] }, projections: { count: 3, sample: 'float32', quantity: 'line_integral' },
+		geometry: { kind: 'circular', source_to_isocentre_mm: 600, source_to_detector_mm: 1000, angle_step_deg: 120 } }
+	const made = []
+	for (let i = 0; i < 52; i++)
+		made.push((await post('/v1/scans', { ...plain, name: `many ${i}` })).id)
+	const page = await open(browser, '/#/')
+	await until('fifty', () => page.locator('.scans li').count(), count => count === 50)
+	expect((await page.textContent('.scans li')).includes('many 51'), 'the newest first')
+	await page.click('button:has-text("Older scans")')
+	await until('all', () => page.locator('.scans li').count(), count => count > 52)
+	await page.fill('[type=search]', 'many 1')
+	await until('found', () => page.locator('.scans li').count(), count => count === 11)
+	await page.context().close()
+	for (const id of made)
+		await fetch(`${origin}/v1/scans/${id}`, { method: 'DELETE' })
+})
+
 test('light or dark and the language are chosen, and stay chosen; the pictures are dark', async () => {
 	const page = await openFinished({ colorScheme: 'light', locale: 'de-DE' })
 	const ground = () => page.evaluate(() => Math.max(...getComputedStyle(document.documentElement).backgroundColor.match(/\d+/g).map(Number)))

@@ -53,6 +53,21 @@ export const newId = prefix => `${prefix}-${++lastId}`
 
 /* ---- numbers and times ---- */
 
+/* What writes numbers or dates in a language, made once: making one takes as long as writing a hundred. */
+function formats(Format, languageOf) {
+	const made = new Map()
+	return options => {
+		const key = `${language()} ${JSON.stringify(options)}`
+		if (!made.has(key))
+			made.set(key, new Format(languageOf(), options))
+		return made.get(key)
+	}
+}
+
+const numbers = formats(Intl.NumberFormat, language)
+/* English dates are those of the reader's own country. */
+const dates = formats(Intl.DateTimeFormat, () => language() === 'en' ? undefined : language())
+
 export function number(value, digits = 3) {
 	if (value === null || value === undefined || !Number.isFinite(value))
 		return '–'
@@ -61,12 +76,12 @@ export function number(value, digits = 3) {
 		const [mantissa, exponent] = value.toExponential(digits - 1).split('e')
 		return `${fixed(Number(mantissa), digits - 1)} × 10${superscript(Number(exponent))}`
 	}
-	return value.toLocaleString(language(), { maximumSignificantDigits: digits, useGrouping: size >= 1e4 }).replace('-', '−')
+	return numbers({ maximumSignificantDigits: digits, useGrouping: size >= 1e4 }).format(value).replace('-', '−')
 }
 
 /* With so many places behind the point, which is a comma in other languages. */
 export const fixed = (value, places = 1) =>
-	value.toLocaleString(language(), { minimumFractionDigits: places, maximumFractionDigits: places, useGrouping: false }).replace(/^-/, '−')
+	numbers({ minimumFractionDigits: places, maximumFractionDigits: places, useGrouping: false }).format(value).replace(/^-/, '−')
 
 const superscripts = '⁰¹²³⁴⁵⁶⁷⁸⁹'
 export function superscript(exponent) {
@@ -101,14 +116,14 @@ export function moment(text) {
 	if (!text)
 		return '–'
 	const date = new Date(text), today = new Date()
-	const time = date.toLocaleTimeString(language() === 'en' ? [] : language(), { hour: '2-digit', minute: '2-digit' })
+	const time = dates({ hour: '2-digit', minute: '2-digit' }).format(date)
 	return date.toDateString() === today.toDateString()
 		? t('today {time}', { time })
-		: `${date.toLocaleDateString(language() === 'en' ? [] : language(), { day: 'numeric', month: 'short', year: date.getFullYear() === today.getFullYear() ? undefined : 'numeric' })} ${time}`
+		: `${dates({ day: 'numeric', month: 'short', ...date.getFullYear() !== today.getFullYear() && { year: 'numeric' } }).format(date)} ${time}`
 }
 
 /* Day and time, to the second. */
-export const fullTime = text => new Date(text).toLocaleString(language() === 'en' ? [] : language())
+export const fullTime = text => dates({ year: 'numeric', month: 'numeric', day: 'numeric', hour: 'numeric', minute: 'numeric', second: 'numeric' }).format(new Date(text))
 
 export function timeElement(text) {
 	return h('time', { datetime: text ?? '', title: text ? fullTime(text) : '' }, moment(text))
@@ -147,6 +162,22 @@ export function throttle(milliseconds, f) {
 		again = false
 	}
 	return ask
+}
+
+/* f of each element of a list, a few milliseconds of them at a time; false where wanted() says no more in between. */
+export async function inPieces(list, f, wanted) {
+	const some = 8 /* ms */
+	let end = performance.now() + some
+	for (const element of list) {
+		f(element)
+		if (performance.now() < end)
+			continue
+		await new Promise(resolve => setTimeout(resolve))
+		if (!wanted())
+			return false
+		end = performance.now() + some
+	}
+	return true
 }
 
 /* f in the next frame, once. */

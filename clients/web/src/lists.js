@@ -1,5 +1,5 @@
 /* The first page: what runs, waits, is done and has failed, as it changes; the scans; what is bounded. */
-import { h, replace, write, throttle, timeElement, bytes, duration, number } from './dom.js'
+import { h, replace, write, throttle, inPieces, timeElement, bytes, duration, number } from './dom.js'
 import { get, id, watch, volumePath } from './api.js'
 import { Bar, badge, doing, left, ended, recipeText } from './state.js'
 import { reconstructAgain } from './form.js'
@@ -9,6 +9,7 @@ import { t, t2 } from './lang.js'
 const pollTime = 2000 /* ms, while a job runs */
 const typingTime = 250 /* ms between letters and asking */
 const pageSize = 50
+const scansFirst = 50 /* scans that are shown before one asks for more */
 const differencesMost = 4
 
 const plain = value => String(value)
@@ -68,17 +69,20 @@ class Part {
 	}
 }
 
-/* What tells jobs of one scan apart, by id: the parameters of their stages in which they differ; the recipe is there. */
-function differences(jobs) {
+/* What tells jobs of one scan apart, by id: the parameters of their stages in which they differ; the recipe is there. null: not wanted any more. */
+async function differences(jobs, wanted) {
 	const fields = groups.filter(group => !group.three).flatMap(group => group.fields).filter(field => !['/emit', '/priority'].includes(field.pointer)), found = new Map()
+	const scans = new Map()
+	for (const job of jobs)
+		scans.set(job.scan, [...scans.get(job.scan) ?? [], job])
 	const text = (job, field) => valueText(job, field, value => number(value, 4), t)
-	for (const scan of new Set(jobs.map(job => job.scan))) {
-		const alike = jobs.filter(job => job.scan === scan)
-		const apart = fields.filter(field => new Set(alike.map(job => text(job, field)).filter(value => value !== null)).size > 1)
-		for (const job of alike)
-			found.set(job.id, apart.filter(field => text(job, field) !== null).slice(0, differencesMost).map(field => `${t(field.label).split(', ')[0].toLowerCase()} ${text(job, field)}`).join(', '))
+	const tell = alike => {
+		const texts = fields.map(field => alike.map(job => text(job, field)))
+		const apart = fields.map((field, i) => [field, texts[i]]).filter(([, values]) => new Set(values.filter(value => value !== null)).size > 1)
+		alike.forEach((job, i) => found.set(job.id, apart.filter(([, values]) => values[i] !== null).slice(0, differencesMost).map(([field, values]) => `${t(field.label).split(', ')[0].toLowerCase()} ${values[i]}`).join(', ')))
 	}
-	return found
+	/* A job alone differs from none. */
+	return await inPieces([...scans.values()].filter(alike => alike.length > 1), tell, wanted) ? found : null
 }
 
 export class ListPage {
@@ -88,6 +92,9 @@ export class ListPage {
 	#older = [] /* pages behind the first, as they were fetched */
 	#next = null
 	#scans = new Map()
+	#scanRows = new Map() /* id -> { state, element } */
+	#scansMost = scansFirst
+	#showing = 0 /* the last #show */
 	#abort = new AbortController()
 	#closed = false
 
@@ -101,7 +108,8 @@ export class ListPage {
 		this.noJobs = h('p', { class: 'empty', hidden: true })
 		this.more = h('button', { type: 'button', hidden: true, onclick: () => this.#fetchMore() }, t('Older jobs'))
 		this.scans = h('ul', { class: 'scans' })
-		this.scanSection = h('section', { hidden: true }, h('h2', {}, t('Scans')), this.scans)
+		this.moreScans = h('button', { type: 'button', hidden: true, onclick: () => { this.#scansMost *= 4; this.#show(this.search.value.trim()) } }, t('Older scans'))
+		this.scanSection = h('section', { hidden: true }, h('h2', {}, t('Scans')), this.scans, this.moreScans)
 		this.trouble = h('div', { class: 'notice bad', role: 'alert', hidden: true })
 		this.limits = h('ul', { class: 'limits' })
 		this.limitSection = h('section', { hidden: true }, h('h2', {}, t('Limits')), this.limits)
@@ -157,7 +165,7 @@ export class ListPage {
 				this.#next = done.next
 			this.#scans = new Map(scans.scans.map(scan => [scan.id, scan]))
 			this.trouble.hidden = true
-			this.#show(text)
+			await this.#show(text)
 			this.#showLimits(limitLines(limits))
 		} catch (error) {
 			if (this.#closed)
@@ -171,19 +179,25 @@ export class ListPage {
 		const page = await this.#list(['succeeded', 'failed', 'cancelled'], { limit: pageSize, after: this.#next })
 		this.#older.push(...page.jobs)
 		this.#next = page.next
-		this.#show(this.search.value.trim())
+		await this.#show(this.search.value.trim())
 	}
 
 	/* ---- what is shown ---- */
 
-	#show(text) {
+	/* Rows are made in pieces, so that a long list holds nothing up; a later call ends this one. */
+	async #show(text) {
+		const number = ++this.#showing, wanted = () => number === this.#showing && !this.#closed
 		const known = new Set([...this.#open, ...this.#jobs].map(job => job.id))
-		const all = [...this.#open, ...this.#jobs, ...this.#older.filter(job => !known.has(job.id))], apart = differences(all)
-		this.#rows = new Map(all.map(job => {
+		const all = [...this.#open, ...this.#jobs, ...this.#older.filter(job => !known.has(job.id))], rows = new Map()
+		const apart = await differences(all, wanted)
+		const make = job => {
 			const row = this.#rows.get(job.id) ?? new Row()
 			row.show(job, this.#scans.get(job.scan), apart.get(job.id))
-			return [job.id, row]
-		}))
+			rows.set(job.id, row)
+		}
+		if (apart === null || !await inPieces(all, make, wanted))
+			return
+		this.#rows = rows
 		let rest = all
 		for (const part of this.parts) {
 			const taken = rest.filter(part.takes)
@@ -194,7 +208,7 @@ export class ListPage {
 		write(this.noJobs, asked ? t('No job is like that.') : t('No jobs yet. They appear here as soon as acquisition software posts one.'))
 		this.noJobs.hidden = all.length > 0
 		this.more.hidden = this.#next === null
-		this.#showScans(text)
+		await this.#showScans(text, wanted)
 	}
 
 	#showLimits(lines) {
@@ -202,24 +216,31 @@ export class ListPage {
 		replace(this.limits, lines.map(line => h('li', {}, line)))
 	}
 
-	#showScans(text) {
-		const scans = [...this.#scans.values()].filter(scan => `${scan.name} ${scan.id}`.toLowerCase().includes(text.toLowerCase()))
-		this.scanSection.hidden = scans.length === 0
-		const state = JSON.stringify(scans)
-		if (this.scans.dataset.state === state)
+	async #showScans(text, wanted) {
+		const scans = [...this.#scans.values()].filter(scan => `${scan.name} ${scan.id}`.toLowerCase().includes(text.toLowerCase())), rows = new Map()
+		const make = scan => {
+			const state = JSON.stringify(scan), row = this.#scanRows.get(scan.id)
+			rows.set(scan.id, row?.state === state ? row : { state, element: this.#scanRow(scan) })
+		}
+		if (!await inPieces(scans.slice(0, this.#scansMost), make, wanted))
 			return
-		this.scans.dataset.state = state
-		replace(this.scans, scans.map(scan => {
-			const name = nameOf(scan)
-			const reconstruct = t('Reconstruct {name}', { name })
-			return h('li', {},
-				h('a', { class: 'name', href: `#/scans/${id(scan.id)}` }, name),
-				h('span', { class: 'detail' }, scan.state === 'complete' ? t2(scan.projections.count, '{n} projection', '{n} projections') : t('{n} of {all} projections', { n: scan.received_count, all: scan.projections.count }),
-					` · ${scan.detector.columns} × ${scan.detector.rows}`),
-				scan.pinned && h('span', { class: 'detail' }, t('pinned')),
-				h('span', { class: 'when' }, timeElement(scan.created)),
-				h('button', { type: 'button', class: 'quiet acquires', 'aria-label': reconstruct, onclick: () => reconstructAgain({ scan: scan.id }, reconstruct) }, t('Reconstruct …')))
-		}))
+		this.scanSection.hidden = scans.length === 0
+		this.moreScans.hidden = scans.length <= this.#scansMost
+		const elements = [...rows.values()].map(row => row.element)
+		if (elements.length !== this.scans.children.length || elements.some((element, i) => this.scans.children[i] !== element))
+			this.scans.replaceChildren(...elements)
+		this.#scanRows = rows
+	}
+
+	#scanRow(scan) {
+		const name = nameOf(scan), reconstruct = t('Reconstruct {name}', { name })
+		return h('li', {},
+			h('a', { class: 'name', href: `#/scans/${id(scan.id)}` }, name),
+			h('span', { class: 'detail' }, scan.state === 'complete' ? t2(scan.projections.count, '{n} projection', '{n} projections') : t('{n} of {all} projections', { n: scan.received_count, all: scan.projections.count }),
+				` · ${scan.detector.columns} × ${scan.detector.rows}`),
+			scan.pinned && h('span', { class: 'detail' }, t('pinned')),
+			h('span', { class: 'when' }, timeElement(scan.created)),
+			h('button', { type: 'button', class: 'quiet acquires', 'aria-label': reconstruct, onclick: () => reconstructAgain({ scan: scan.id }, reconstruct) }, t('Reconstruct …')))
 	}
 
 	close() {

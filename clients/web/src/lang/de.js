@@ -121,6 +121,7 @@ export const strings = {
 	'Not kept with the job: {why}': 'Nicht beim Auftrag aufbewahrt: {why}',
 	'Off': 'Aus',
 	'Older jobs': 'Ältere Aufträge',
+	'Older scans': 'Ältere Scans',
 	'Pan': 'Schieben',
 	'Patient': 'Patient',
 	'Pause': 'Anhalten',
