@@ -287,13 +287,13 @@ START_TEST(the_default_s_mean_has_the_variance_that_it_is_asked_for)
 	ck_assert_double_eq_tol(averaging_width(1.5), 4, 1e-6);
 	ck_assert_double_eq(averaging_width(0), 1);
 	/* None for objects of voxels, for pixels as large as voxels, or far smaller ones; less of it for much noise. */
-	ck_assert_double_eq(averaging_variance(2.5, .13, 0, 0), 0);
-	ck_assert_double_eq(averaging_variance(1.2, 0, 0, 0), 0);
-	ck_assert_double_eq(averaging_variance(3.1, .2, 0, 0), 0);
-	ck_assert_double_eq_tol(averaging_variance(2.5, .2, 0, 0), .15, 1e-9);
-	ck_assert_double_eq_tol(averaging_variance(2.5, .2, 1, 0), .09, 1e-9);
-	ck_assert_double_eq_tol(averaging_variance(2.5, 0, 0, 0), .15, 1e-9);
-	ck_assert_double_eq_tol(averaging_variance(1.5, 0, 0, 0), .09, 1e-9);
+	ck_assert_double_eq(averaging_variance(2.5, .13, 0, 0, 0), 0);
+	ck_assert_double_eq(averaging_variance(1.2, 0, 0, 0, 0), 0);
+	ck_assert_double_eq(averaging_variance(3.1, .2, 0, 0, 0), 0);
+	ck_assert_double_eq_tol(averaging_variance(2.5, .2, 0, 0, 0), .15, 1e-9);
+	ck_assert_double_eq_tol(averaging_variance(2.5, .2, 1, 0, 0), .09, 1e-9);
+	ck_assert_double_eq_tol(averaging_variance(2.5, 0, 0, 0, 0), .15, 1e-9);
+	ck_assert_double_eq_tol(averaging_variance(1.5, 0, 0, 0, 0), .09, 1e-9);
 }
 END_TEST
 
