@@ -194,15 +194,15 @@ $(BUILD)/cbctd-without-postgresql: $(filter-out $(BUILD)/daemon/store/postgresql
 
 gpu_programs := $(BUILD)/gpu_check $(BUILD)/gpu_bench $(BUILD)/gpu_cards
 # Every program that a test or a benchmark runs, so that none stops compiling unseen.
-test-programs: $(addprefix $(BUILD)/,unit cbct-worker-held cbctd-held cbctd-without-postgresql manual faults.so every.so live_bytes.so simulated-nvml/libnvidia-ml.so.1 cpu-bench calibrate-bench agreement refine denoise presets stopping methods watchers slices acquire paper-project rabbitct) \
+test-programs: $(addprefix $(BUILD)/,unit cbct-worker-held cbctd-held cbctd-without-postgresql manual faults.so clock.so every.so live_bytes.so simulated-nvml/libnvidia-ml.so.1 cpu-bench calibrate-bench agreement refine denoise presets stopping methods watchers slices acquire paper-project rabbitct) \
                $(if $(cuda_objects),$(gpu_programs) $(BUILD)/gpu_ceilings $(BUILD)/cbct-worker-faulty,$(call objects,$(wildcard tests/bench/gpu_*.c)))
 
 # Faults of the disk, loaded into the programs by tests.
 $(BUILD)/faults.so: tests/http/faults.c
 	$(call say,CC  )$(CC) -std=c11 -O1 -Wall -Wextra -fPIC -shared -o $@ $< -ldl
 
-# One call that fails, or a count of what is allocated, loaded into the programs by tests.
-$(BUILD)/every.so $(BUILD)/live_bytes.so: $(BUILD)/%.so: tests/http/%.c
+# One call that fails, a count of what is allocated, or a clock that is off, loaded into the programs by tests.
+$(BUILD)/every.so $(BUILD)/live_bytes.so $(BUILD)/clock.so: $(BUILD)/%.so: tests/http/%.c
 	$(call say,CC  )$(CC) -std=c11 -O1 -Wall -Wextra -fPIC -shared -o $@ $< -ldl
 
 # Cards that are not there, for tests of what is told of cards.

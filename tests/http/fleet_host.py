@@ -23,21 +23,23 @@ def wait_for(condition, seconds, what):
 
 
 class Host:
-    """options: build, folder, database. takes: it has an address, so that it may take other hosts' jobs."""
+    """options: build, folder, database. takes: it has an address, so that it may take other hosts' jobs. doors: of a host in another
+    network, its address, the command that starts programs there, the SSL context and the headers of requests to it."""
 
-    def __init__(self, options, fleet, name, takes, arguments=(), environment=None):
+    def __init__(self, options, fleet, name, takes, arguments=(), environment=None, doors=None):
         self.name, self.port = name, free_port()
+        self.address, self.within, self.context, self.headers = doors or ("127.0.0.1", [], None, {})
         self.folder, self.log = options.folder / name, options.folder / f"{name}.err"
-        self.arguments = [f"{options.build}/cbctd", "--listen", f"127.0.0.1:{self.port}", "--state-dir", str(self.folder), "--backend", "cpu",
+        self.arguments = [f"{options.build}/cbctd", "--listen", f"{self.address}:{self.port}", "--state-dir", str(self.folder), "--backend", "cpu",
                           "--threads", "1", "--fleet", fleet, "--fleet-database", options.database, "--fleet-host", name, *arguments]
         if takes:
-            self.arguments += ["--fleet-address", f"http://127.0.0.1:{self.port}"]
+            self.arguments += ["--fleet-address", f"{'https' if self.context else 'http'}://{self.address}:{self.port}"]
         self.environment = dict(os.environ, **(environment or {}))
         self.process = None
 
     def start(self):
         with open(self.log, "ab") as log:
-            self.process = subprocess.Popen(self.arguments, stdout=subprocess.DEVNULL, stderr=log, env=self.environment)
+            self.process = subprocess.Popen([*self.within, *self.arguments], stdout=subprocess.DEVNULL, stderr=log, env=self.environment)
         wait_for(lambda: self.ask("GET", "/livez")[0] == 200, 60, f"host {self.name} answers")
 
     def kill(self):
@@ -46,9 +48,12 @@ class Host:
 
     def ask(self, method, path, body=None, headers=None):
         """Status and body; status 0: no answer."""
-        connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=60)
+        if self.context:
+            connection = http.client.HTTPSConnection(self.address, self.port, timeout=60, context=self.context)
+        else:
+            connection = http.client.HTTPConnection(self.address, self.port, timeout=60)
         try:
-            connection.request(method, path, body, headers or {})
+            connection.request(method, path, body, dict(self.headers, **(headers or {})))
             reply = connection.getresponse()
             return reply.status, reply.read()
         except (OSError, http.client.HTTPException):
