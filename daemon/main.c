@@ -192,6 +192,7 @@ static struct fleet_options fleet_options_of(const struct config *config)
 				      .url = config->fleet_address,
 				      .lease = config->fleet_lease,
 				      .keep_scans = config->fleet_keep_scans,
+				      .link = (double)config->fleet_link,
 				      .timeout = config->catalogue_timeout};
 }
 

@@ -74,8 +74,11 @@ static const struct field opened_fields[] = {FIELD("job", FIELD_STRING, job),
 					     FIELD("host", FIELD_SIZE, memory.host),
 					     FIELD("plan", FIELD_STRING, plan),
 					     {0}};
-static const struct field reconstructed_fields[] = {
-    FIELD("job", FIELD_STRING, job), FIELD("count", FIELD_INT, count), {0}};
+static const struct field reconstructed_fields[] = {FIELD("job", FIELD_STRING, job),
+						    FIELD("count", FIELD_INT, count),
+						    FIELD("bytes", FIELD_SIZE, bytes),
+						    FIELD("seconds", FIELD_NUMBER, row.seconds),
+						    {0}};
 static const struct field progress_fields[] = {FIELD("job", FIELD_STRING, job),
 					       FIELD("stage", FIELD_STAGE, stage),
 					       FIELD("iteration", FIELD_INT, iteration),

@@ -35,18 +35,22 @@ enum message_kind {
 	 * take by its nature, 0: as any other. Every second (proto/heartbeat.h), also without a job.
 	 */
 	MESSAGE_ALIVE,
-	MESSAGE_OPENED,        /* job, memory, plan */
-	MESSAGE_RECONSTRUCTED, /* job, count: projections reconstructed so far */
-	MESSAGE_PROGRESS,      /* job, stage, iteration, fraction */
-	MESSAGE_ROW,           /* job, row */
-	MESSAGE_VOLUME,        /* job, name, stage, iteration, bytes, norms, estimate_mm, support: the file is there,
-				  whole, for everybody */
-	MESSAGE_SETTLED,       /* job, name: that file is on the disk; before the job ends, but for what failed */
-	MESSAGE_CHECKPOINT,    /* job, iteration: a checkpoint of it is on the disk */
-	MESSAGE_NOISE,         /* job, noise_hu, alpha: what TV goes by, see recon_hooks.denoising */
-	MESSAGE_AGREEMENT,     /* job, agreement: how well the projections agree with the geometry */
-	MESSAGE_STOPPED,       /* job, stop: how automatic iterations ended */
-	MESSAGE_WARNING,       /* job, code, detail */
+	MESSAGE_OPENED, /* job, memory, plan */
+	/*
+	 * job, count: projections reconstructed so far; of a place on another host sent there, and how many bytes went
+	 * in the last step, in row.seconds
+	 */
+	MESSAGE_RECONSTRUCTED,
+	MESSAGE_PROGRESS,   /* job, stage, iteration, fraction */
+	MESSAGE_ROW,        /* job, row */
+	MESSAGE_VOLUME,     /* job, name, stage, iteration, bytes, norms, estimate_mm, support: the file is there,
+			       whole, for everybody */
+	MESSAGE_SETTLED,    /* job, name: that file is on the disk; before the job ends, but for what failed */
+	MESSAGE_CHECKPOINT, /* job, iteration: a checkpoint of it is on the disk */
+	MESSAGE_NOISE,      /* job, noise_hu, alpha: what TV goes by, see recon_hooks.denoising */
+	MESSAGE_AGREEMENT,  /* job, agreement: how well the projections agree with the geometry */
+	MESSAGE_STOPPED,    /* job, stop: how automatic iterations ended */
+	MESSAGE_WARNING,    /* job, code, detail */
 	/*
 	 * job, code (0, ERR_CANCELLED, ERR_BUSY = yielded at `iteration`, or what failed), text; with ERR_DEVICE card,
 	 * the place in `cards` of the device that failed

@@ -8,6 +8,7 @@
 
 #include "clients/cbct/remote_internal.h"
 #include "core/pulse.h"
+#include "proto/clock.h"
 #include "proto/json.h"
 #include "proto/scan_directory.h"
 #include "proto/scatter_file.h"
@@ -229,6 +230,7 @@ int remote_send_some(struct remote *remote, struct error *err)
 	const size_t bytes = scan_projection_bytes(remote->files.scan);
 	const int most = bytes < RUN_BYTES ? (int)(RUN_BYTES / bytes) : 1;
 	struct message told = {.kind = MESSAGE_RECONSTRUCTED};
+	const double began = clock_monotonic();
 	int count = 0, code = 0;
 
 	while (remote->sent < remote->announced && remote->there[remote->sent])
@@ -241,6 +243,8 @@ int remote_send_some(struct remote *remote, struct error *err)
 		return code;
 	remote->sent += count;
 	told.count = remote->sent;
+	told.bytes = (size_t)count * bytes;
+	told.row.seconds = clock_monotonic() - began;
 	if (remote->sent == remote->files.scan->count)
 		code = know_projections(remote, err);
 	return code == 0 ? remote_tell(remote, &told, err) : code;

@@ -26,6 +26,8 @@ static int fleet_homes(struct fleet *fleet, struct error *err)
 	code = homes_tell(fleet->homes, fleet->jobs, fleet->ledger, err);
 	if (code == 0)
 		code = homes_read(fleet->homes, fleet->ledger, err);
+	if (code == 0)
+		code = fleet_read_rates(fleet, err);
 	fleet->told_at = clock_monotonic();
 	if (code == 0)
 		fleet_clear_copies(fleet, false);
@@ -58,6 +60,7 @@ static void lose(struct fleet *fleet, const struct error *err)
 	ledger_close(fleet->ledger);
 	fleet->ledger = NULL;
 	atomic_store(&fleet->is_joined, false);
+	jobs_set_hosts(fleet->jobs, NULL, 0); /* no job is kept for them */
 }
 
 static void join_again(struct fleet *fleet)
@@ -176,6 +179,7 @@ int fleet_start(struct jobs *jobs, struct supervise *supervise, const struct fle
 	fleet->supervise = supervise;
 	fleet->homes = options->homes;
 	fleet->keep_scans = options->keep_scans;
+	fleet->link = options->link;
 	snprintf(fleet->name, sizeof(fleet->name), "%s", options->name);
 	snprintf(fleet->database, sizeof(fleet->database), "%s", options->database);
 	snprintf(fleet->host, sizeof(fleet->host), "%s", options->host);

@@ -28,6 +28,7 @@ struct fleet_options {
 	double lease;         /* s */
 	double timeout;       /* s until the database counts as away */
 	double keep_scans;    /* s that a copy of another host's scan is kept for its further jobs */
+	double link;          /* bytes a second to a host to which nothing was sent yet */
 	struct homes *homes;  /* what other hosts have; kept up to date; outlives the fleet. Not of fleet_check */
 };
 

@@ -105,6 +105,19 @@ void homes_takers(struct homes *homes, const struct where *where, int *ret_taker
 	pthread_mutex_unlock(&homes->lock);
 }
 
+int homes_list_takers(struct homes *homes, struct fleet_host *ret_hosts, int most)
+{
+	int count = 0;
+
+	pthread_mutex_lock(&homes->lock);
+	for (int i = 0; i < homes->count && count < most; i++) {
+		if (!homes->hosts[i].facts.away && homes->hosts[i].facts.url[0] != '\0')
+			ret_hosts[count++] = homes->hosts[i].facts;
+	}
+	pthread_mutex_unlock(&homes->lock);
+	return count;
+}
+
 /* ---- what this host has ---- */
 
 static void add_own(struct homes *homes, const char *id)

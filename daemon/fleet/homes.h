@@ -8,7 +8,7 @@
  * Which other host of the fleet has which scan or job, as the ledger says: a request for one of them is passed on to
  * the daemon that has it. What is new on another host is known here within some two seconds.
  *
- * Threads: any for homes_find, homes_named and homes_takers, the fleet's for the two that speak to the ledger.
+ * Threads: any for homes_find, homes_named and the two about takers, the fleet's for the two that speak to the ledger.
  */
 struct homes;
 
@@ -22,6 +22,9 @@ bool homes_find(struct homes *homes, const char *id, struct fleet_host *ret_host
 bool homes_named(struct homes *homes, const char *name, struct fleet_host *ret_host);
 /* Other hosts that were seen within a lease and take jobs; *ret_fit: those whose devices are as `where` wants them. */
 void homes_takers(struct homes *homes, const struct where *where, int *ret_takers, int *ret_fit);
+
+/* Those that were seen within a lease and take jobs, at most `most`; returns how many. */
+int homes_list_takers(struct homes *homes, struct fleet_host *ret_hosts, int most);
 
 /* The others are told what this host has, where that has changed. What it computes for others is theirs. */
 int homes_tell(struct homes *homes, struct jobs *jobs, struct ledger *ledger, struct error *err);

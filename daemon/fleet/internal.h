@@ -54,6 +54,7 @@ struct fleet {
 	struct returned returned[RETURNED_MOST];
 
 	double keep_scans; /* s */
+	double link;       /* bytes a second to hosts to which nothing was sent yet */
 	struct copy copies[COPIES_MOST];
 	int copy_count;
 
@@ -78,6 +79,12 @@ void fleet_clear_copies(struct fleet *fleet, bool all);
 /* ---- taker.c ---- */
 /* Leases are renewed, and jobs of others claimed where devices are free. */
 int fleet_take(struct fleet *fleet, struct error *err);
+
+/* ---- rates.c ---- */
+/* What jobs have taken here, for others. */
+void fleet_tell_rates(struct fleet *fleet, char ret_text[LEDGER_RATES_SIZE]);
+/* What others have told becomes known to the jobs here. */
+int fleet_read_rates(struct fleet *fleet, struct error *err);
 
 /* ---- explain.c ---- */
 /* jobs_explain; the context is the fleet. Any thread. */

@@ -128,13 +128,17 @@ static bool is_worth(struct fleet *fleet, const struct job_offer *offer, bool de
 	struct error ignored;
 	struct job *job;
 	double start;
+	int sooner;
 
 	if (store_scan_look(jobs_store(fleet->jobs), offer->scan, &facts, &ignored) != 0 || facts.closed ||
 	    !facts.ready || jobs_find(fleet->jobs, offer->id, &job, &ignored) != 0)
 		return false;
 	start = job_start_in(job);
+	sooner = job_goes_sooner(job);
 	job_release(job);
-	return !devices || start < 0 || start >= WORTH;
+	if (!devices || offer->elsewhere)
+		return true;
+	return sooner >= 0 ? sooner > 0 : start < 0 || start >= WORTH;
 }
 
 static bool is_offered(const struct offer *offers, int count, const char *job)

@@ -25,6 +25,7 @@ int fleet_take(struct fleet *fleet, struct error *err)
 {
 	const int devices = fleet_devices(fleet, false);
 	double memory[WHERE_DEVICES_MOST];
+	char rates[LEDGER_RATES_SIZE];
 	const int memory_count = fleet_memory(fleet, memory);
 	const bool due =
 	    clock_monotonic() >= fleet->renewed + (fleet->options.lease / 6 < LOOK ? fleet->options.lease / 6 : LOOK);
@@ -33,7 +34,8 @@ int fleet_take(struct fleet *fleet, struct error *err)
 	int code = 0, least;
 
 	if (due) {
-		code = ledger_seen(fleet->ledger, memory, memory_count, err);
+		fleet_tell_rates(fleet, rates);
+		code = ledger_seen(fleet->ledger, memory, memory_count, rates, err);
 		if (code == 0)
 			code = ledger_renew(fleet->ledger, fleet->claims, CLAIMS_MOST, &fleet->claim_count, err);
 		if (code != 0)

@@ -57,15 +57,15 @@ static void work_of(const struct recipe *recipe, const struct job_extent *extent
 	ret_work[STAGE_SAVE] = voxels * (recipe->emits + 1);
 }
 
-static struct job_rate *rate_of(struct jobs *jobs, const struct recipe *recipe, enum stage stage, int devices)
+/* Its place; -1: there is none. */
+static int rate_of(const struct job_rate *rates, int count, const struct recipe *recipe, enum stage stage, int devices)
 {
-	for (int i = 0; i < jobs->rates; i++) {
-		struct job_rate *rate = &jobs->rate[i];
-
-		if (rate->stage == stage && rate->variant == variant_of(recipe, stage) && rate->devices == devices)
-			return rate;
+	for (int i = 0; i < count; i++) {
+		if (rates[i].stage == stage && rates[i].variant == variant_of(recipe, stage) &&
+		    rates[i].devices == devices)
+			return i;
 	}
-	return NULL;
+	return -1;
 }
 
 /* What finding the views' poses takes is no stage's work; the share that is done tells. */
@@ -74,8 +74,7 @@ static bool refines(const struct recipe *recipe)
 	return recipe->refine.geometry || recipe->refine.motion;
 }
 
-/* The devices that the job runs on, or that it will begin with, as far as that is known now. */
-static int devices_of(const struct job *job)
+int job_devices_here(const struct job *job)
 {
 	const int wanted = job->request.devices, there = job->jobs->devices;
 
@@ -91,29 +90,31 @@ void job_measure(struct job *job, const struct job_record *record)
 	const int devices = job_devices(record);
 	double work[STAGE_COUNT];
 
-	/* Of a lost run, or of one that went along with the acquisition, the times are not those of the work. */
-	const bool plain = record->attempts == 1 && record->started - record->queued > not_queued;
+	/*
+	 * Of a lost run, or of one that went along with the acquisition, the times are not those of the work; on
+	 * another host not of the work here. A job of another host's goes along with the sending of its scan: what is
+	 * left to do behind that is what its owner wants to know, and better than nothing for jobs here.
+	 */
+	const bool once = record->attempts == 1 && record->ran_on[0] != '\0';
+	const bool plain = record->started - record->queued > not_queued;
 
-	if (job->unreadable.code != 0 || record->state != JOB_SUCCEEDED || job->extent.views == 0 || !plain ||
-	    refines(recipe))
+	if (job->unreadable.code != 0 || record->state != JOB_SUCCEEDED || job->extent.views == 0 || !once ||
+	    (!plain && !job_is_mirror(record)) || refines(recipe))
 		return;
 	work_of(recipe, &job->extent, record->iteration, work);
 	for (enum stage stage = 0; stage < STAGE_COUNT; stage++) {
-		struct job_rate *rate = rate_of(jobs, recipe, stage, devices);
+		int at = rate_of(jobs->rate, jobs->rates, recipe, stage, devices);
 
-		if (!(work[stage] > 0))
+		if (!(work[stage] > 0) || (at >= 0 && !plain && (stage == STAGE_LOAD || stage == STAGE_FDK)))
 			continue;
-		if (rate == NULL && jobs->rates < JOB_RATES)
-			rate = &jobs->rate[jobs->rates++];
-		else if (rate == NULL)
-			rate = &jobs->rate[jobs->oldest_rate++ % JOB_RATES];
-		*rate =
+		if (at < 0)
+			at = jobs->rates < JOB_RATES ? jobs->rates++ : jobs->oldest_rate++ % JOB_RATES;
+		jobs->rate[at] =
 		    (struct job_rate){stage, variant_of(recipe, stage), devices, record->seconds[stage] / work[stage]};
 	}
 }
 
-/* Seconds on so many devices from beginning to end; NAN: nobody knows. jobs->lock is held. */
-static double whole(struct job *job, int devices)
+double job_whole(struct job *job, const struct job_rate *rates, int count, int devices)
 {
 	const struct recipe *recipe = &job->request.recipe;
 	double work[STAGE_COUNT], seconds = 0;
@@ -123,14 +124,31 @@ static double whole(struct job *job, int devices)
 		return NAN;
 	work_of(recipe, &job->extent, recipe->algorithm != NULL ? recipe->iterate.iterations : 0, work);
 	for (enum stage stage = 0; stage < STAGE_COUNT; stage++) {
-		const struct job_rate *rate = rate_of(job->jobs, recipe, stage, devices);
+		const int at = rate_of(rates, count, recipe, stage, devices);
 
-		if (work[stage] > 0 && rate == NULL)
+		if (work[stage] > 0 && at < 0)
 			return NAN;
 		if (work[stage] > 0)
-			seconds += work[stage] * rate->seconds;
+			seconds += work[stage] * rates[at].seconds;
 	}
 	return seconds;
+}
+
+/* The same on devices here. */
+static double whole(struct job *job, int devices)
+{
+	return job_whole(job, job->jobs->rate, job->jobs->rates, devices);
+}
+
+int jobs_rates(struct jobs *jobs, struct job_rate ret_rates[JOB_RATES])
+{
+	int count;
+
+	pthread_mutex_lock(&jobs->lock);
+	count = jobs->rates;
+	memcpy(ret_rates, jobs->rate, (size_t)count * sizeof(*ret_rates));
+	pthread_mutex_unlock(&jobs->lock);
+	return count;
 }
 
 /* Of a job that runs. */
@@ -138,7 +156,7 @@ static double rest(struct job *job, double now)
 {
 	const struct job_record *record = &job->record;
 	const bool automatic = job->unreadable.code == 0 && job->request.recipe.iterate.automatic;
-	const double done = record->fraction - job->run_fraction, first = whole(job, devices_of(job));
+	const double done = record->fraction - job->run_fraction, first = whole(job, job_devices_here(job));
 	double left = NAN;
 
 	/* How many iterations end by themselves, the share that is done tells. */
@@ -173,7 +191,7 @@ static int sooner(const void *a, const void *b)
 static int course_turn(struct course *course, const struct job *job, double now)
 {
 	const double kept = job->lacks_devices > 0 ? now - job->lacks_devices : 0;
-	int devices = devices_of(job);
+	int devices = job_devices_here(job);
 	double latest;
 
 	devices = devices > course->count ? course->count : devices;
@@ -224,8 +242,7 @@ static bool is_coming(const struct job *job)
 	return job->record.state == JOB_QUEUED && job->hold.obstacle == JOB_UNHINDERED && !job->entry.elsewhere;
 }
 
-/* A queued job's seconds until it has its devices, *ret_devices of them. */
-static double wait_of(struct job *job, double now, int *ret_devices)
+double job_turn_in(struct job *job, double now, int *ret_devices)
 {
 	struct course course;
 
@@ -259,7 +276,7 @@ double job_start_in(struct job *job)
 
 	pthread_mutex_lock(&job->jobs->lock);
 	if (is_coming(job))
-		seconds = wait_of(job, now, &devices);
+		seconds = job_turn_in(job, now, &devices);
 	pthread_mutex_unlock(&job->jobs->lock);
 	return known(seconds);
 }
@@ -273,7 +290,7 @@ double job_eta(struct job *job)
 	if (job->record.state == JOB_RUNNING) {
 		seconds = rest(job, now);
 	} else if (is_coming(job)) {
-		seconds = wait_of(job, now, &devices);
+		seconds = job_turn_in(job, now, &devices);
 		seconds += whole(job, devices) * (1 - job->record.fraction);
 	}
 	pthread_mutex_unlock(&job->jobs->lock);

@@ -262,6 +262,7 @@ static void choose_devices(struct supervise *supervise, struct worker *worker, s
 void supervise_dispatch(struct supervise *supervise)
 {
 	struct error err;
+	double away;
 	int code = 0;
 
 	supervise->kept_until = 0;
@@ -284,6 +285,9 @@ void supervise_dispatch(struct supervise *supervise)
 		code = give_job(supervise, worker, job, &chosen, arriving, &err);
 		job_release(job);
 	}
+	away = jobs_kept_away(supervise->jobs);
+	if (away > 0 && (supervise->kept_until == 0 || away < supervise->kept_until))
+		supervise->kept_until = away;
 	if (code != 0) {
 		log_line(LEVEL_ERROR, "no job can be started: %s", err.text);
 		supervise->dispatch_at = clock_monotonic() + RETRY;

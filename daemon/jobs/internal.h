@@ -26,8 +26,9 @@ struct job {
 
 	struct job_extent {
 		int views;
-		double samples;
-	} extent; /* of its scan; 0: it has gone */
+		double samples, bytes;
+		bool closed; /* with projections missing: it stays here */
+	} extent;            /* of its scan; 0: it has gone */
 
 	struct job_trial trial; /* the supervisor's own */
 	int doubts;             /* job_doubt, with the next; the supervisor's own */
@@ -42,6 +43,7 @@ struct job {
 	int references; /* one of them is the array's */
 	bool removed;
 	bool stays;                    /* job_stay */
+	double away_until;             /* monotonic: kept for other hosts; 0: not looked at yet; below: it never is */
 	double lacks_devices;          /* monotonic, job_lacks_devices; 0: it does not */
 	struct client *client;         /* constant; what it points to is not */
 	bool active;                   /* counted in its client's */
@@ -60,15 +62,6 @@ struct client {
 	char name[STORE_CLIENT_SIZE];
 	struct queue_client share;
 	struct client *next;
-};
-
-/* Seconds a unit of work in a stage: forecast.c. */
-enum { JOB_RATES = 64 };
-struct job_rate {
-	enum stage stage;
-	unsigned variant;
-	int devices; /* that it ran on */
-	double seconds;
 };
 
 struct jobs {
@@ -92,7 +85,9 @@ struct jobs {
 	char host[WHERE_HOST_SIZE];
 	double device_bytes[WHERE_DEVICES_MOST];
 	int devices, devices_most;
-	double keep_devices;   /* s */
+	double keep_devices;                     /* s */
+	struct jobs_host hosts[JOBS_HOSTS_MOST]; /* jobs_set_hosts */
+	int host_count;
 	jobs_explain *explain; /* jobs_set_explain, with the next */
 	void *explain_context;
 };
@@ -113,6 +108,19 @@ struct job *job_of_entry(const struct queue_entry *entry);
 /* ---- jobs/forecast.c ---- */
 /* What a job that has succeeded took, for those that come. jobs->lock is held, or nobody else has the jobs yet. */
 void job_measure(struct job *job, const struct job_record *record);
+
+/* Seconds on so many devices from beginning to end, by those rates; NAN: nobody knows. jobs->lock is held. */
+double job_whole(struct job *job, const struct job_rate *rates, int count, int devices);
+/* The devices that the job runs on, or that it will begin with, as far as that is known now. jobs->lock is held. */
+int job_devices_here(const struct job *job);
+/* A queued job's seconds until it has its devices, *ret_devices of them; NAN. jobs->lock is held. */
+double job_turn_in(struct job *job, double now, int *ret_devices);
+
+/* ---- jobs/choice.c ---- */
+/* It is kept for other hosts just now, though a device here may be free. jobs->lock is held. */
+bool job_is_kept_away(struct job *job, double now);
+/* Another host may have it, as far as the job is concerned. jobs->lock is held. */
+bool job_may_go(const struct job *job);
 
 /* ---- jobs/share.c ---- */
 /* How many devices the job runs on, or ran on last; 1 where it is not known. */

@@ -251,7 +251,9 @@ static int recover(struct job *job, struct error *err)
 
 static struct job_extent extent_of(const struct scan_facts *scan)
 {
-	return (struct job_extent){scan->count, (double)scan->count * scan->columns * scan->rows};
+	const double samples = (double)scan->count * scan->columns * scan->rows;
+
+	return (struct job_extent){scan->count, samples, samples * (double)sample_bytes(scan->sample), scan->closed};
 }
 
 static int load_jobs(struct jobs *jobs, struct error *err)

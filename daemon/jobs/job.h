@@ -147,7 +147,7 @@ struct job_offer {
 	char id[ID_SIZE], scan[ID_SIZE];
 	enum priority priority;
 	struct where where;
-	bool elsewhere; /* no device here may have it */
+	bool elsewhere; /* no device here may have it, or it is kept for other hosts just now */
 };
 /*
  * Queued jobs that another host may compute, in the order of the queue behind the first `skip` of it that may run here,
@@ -245,6 +245,35 @@ enum job_obstacle job_obstacle(struct job *job); /* any thread */
  */
 typedef void jobs_explain(void *context, const struct where *where, bool elsewhere, char *ret_text, size_t size);
 void jobs_set_explain(struct jobs *jobs, jobs_explain *explain, void *context);
+
+/* ---- whether a job goes to another host: jobs/choice.c ---- */
+/* Seconds a unit of work in a stage on so many devices: forecast.c. */
+enum { JOB_RATES = 64 };
+struct job_rate {
+	enum stage stage;
+	unsigned variant;
+	int devices; /* that it ran on */
+	double seconds;
+};
+/* What jobs have taken here; returns how many. Any thread. */
+int jobs_rates(struct jobs *jobs, struct job_rate ret_rates[JOB_RATES]);
+/* Another host that takes jobs of this one. */
+enum { JOBS_HOSTS_MOST = 32 };
+struct jobs_host {
+	char name[WHERE_HOST_SIZE];
+	double memory[WHERE_DEVICES_MOST]; /* bytes of each device */
+	int devices, rates;
+	double link; /* bytes a second on the way there and back */
+	struct job_rate rate[JOB_RATES];
+};
+/* From now on there are these, at most JOBS_HOSTS_MOST; they are copied. */
+void jobs_set_hosts(struct jobs *jobs, const struct jobs_host *hosts, int count);
+/*
+ * By what jobs have taken here and there: 1 where another host would have done the queued job sooner, with what is sent
+ * and fetched for it, than devices here that it would have to wait for; 0 where it would not; -1: nobody can know.
+ */
+int job_goes_sooner(struct job *job);
+
 enum { JOB_WAIT_SIZE = 320 };
 void job_wait_text(struct job *job, char ret_text[JOB_WAIT_SIZE]); /* any thread */
 struct job_trial *job_trial(struct job *job);
@@ -297,6 +326,9 @@ int job_sync_volumes(struct job *job, struct error *err);
 /* See store_job_digest_volume. */
 int job_digest_volume(struct job *job, const struct volume_record *volume, struct error *err);
 int job_add_warning(struct job *job, const char *code, const char *detail, struct error *err);
+
+/* Until when the first of the jobs stays that are kept for other hosts just now, CLOCK_MONOTONIC; 0: none is. */
+double jobs_kept_away(struct jobs *jobs);
 
 /* ---- checkpoints that go from daemon to daemon: jobs/resume.c ---- */
 /* A checkpoint comes in pieces of so many bytes, the last one shorter, which may be none. */

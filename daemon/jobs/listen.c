@@ -192,6 +192,8 @@ static int on_message(struct supervise *supervise, struct worker *worker, const 
 		break;
 	case MESSAGE_RECONSTRUCTED:
 		worker->reconstructed = message->count;
+		if (worker->remote)
+			remote_measure(supervise, worker, (double)message->bytes, message->row.seconds);
 		job_reconstructed(worker->job, message->count);
 		worker_attend(supervise, worker);
 		break;

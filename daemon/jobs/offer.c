@@ -4,6 +4,7 @@
 #include <string.h>
 
 #include "daemon/jobs/internal.h"
+#include "proto/clock.h"
 
 const char *job_mirror_key(const struct job_record *record)
 {
@@ -25,28 +26,23 @@ void job_stay(struct job *job)
 	pthread_mutex_unlock(&job->jobs->lock);
 }
 
-static bool may_go(const struct job *job)
-{
-	const bool home = !job->entry.elsewhere && job->stays;
-
-	return !job->entry.held && !home && !job_is_mirror(&job->record) && job->unreadable.code == 0;
-}
-
 int jobs_offers(struct jobs *jobs, int skip, struct job_offer *ret_offers, int most)
 {
+	const double now = clock_monotonic();
 	int count = 0;
 
 	pthread_mutex_lock(&jobs->lock);
 	for (const struct queue_entry *entry = jobs->queue.first; entry != NULL && count < most; entry = entry->next) {
-		const struct job *job = job_of_entry(entry);
+		struct job *job = job_of_entry(entry);
+		const bool away = job_is_kept_away(job, now);
 
-		/* The first go to devices here, but for those that may not. */
-		if ((!entry->elsewhere && skip-- > 0) || !may_go(job))
+		/* The first go to devices here, but for those that may not, or are kept for other hosts. */
+		if ((!entry->elsewhere && !away && skip-- > 0) || !job_may_go(job))
 			continue;
 		memcpy(ret_offers[count].id, job->id, sizeof(job->id));
 		memcpy(ret_offers[count].scan, job->scan, sizeof(job->scan));
 		ret_offers[count].where = job_request_where(&job->request);
-		ret_offers[count].elsewhere = entry->elsewhere;
+		ret_offers[count].elsewhere = entry->elsewhere || away;
 		ret_offers[count++].priority = job->record.priority;
 	}
 	pthread_mutex_unlock(&jobs->lock);
@@ -60,7 +56,7 @@ static void add_arriving(struct job *job, double since, struct job_offer *ret_of
 	bool may;
 
 	pthread_mutex_lock(&job->jobs->lock);
-	may = may_go(job) && !job->record.cancel_asked;
+	may = job_may_go(job) && !job->record.cancel_asked;
 	*offer = (struct job_offer){.priority = job->record.priority,
 				    .where = job_request_where(&job->request),
 				    .elsewhere = job->entry.elsewhere};

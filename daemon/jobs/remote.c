@@ -14,6 +14,8 @@
 /* Runs that other hosts have given back, after which a job stays here: somewhere on that way is a fault of its own. */
 enum { GIVEN_BACK_MOST = 10 };
 
+static const double LINK_BYTES = 1e6;   /* of fewer the time is that of a request, and says nothing of the link */
+static const double LINK_SHARE = 0.3;   /* of the last step in what is known of a link */
 static const double TROUBLE_KEPT = 120; /* s: longer than a job that comes back stays with nobody */
 static const double TIDY = 5;           /* s that a process has behind its job to remove it from the other host */
 
@@ -204,6 +206,46 @@ void remote_trouble(struct supervise *supervise, const struct worker *worker, co
 	if (why != NULL && !told)
 		log_line(LEVEL_WARNING, "host %s of the fleet has claimed job %s and cannot be given it: %s",
 			 worker->place.host, worker->place.job, why);
+}
+
+static struct link *find_link(struct supervise *supervise, const char *host)
+{
+	const int known = supervise->links_known < LINKS_MAX ? supervise->links_known : LINKS_MAX;
+
+	for (int i = 0; i < known; i++) {
+		if (strcmp(supervise->links[i].host, host) == 0)
+			return &supervise->links[i];
+	}
+	return NULL;
+}
+
+void remote_measure(struct supervise *supervise, const struct worker *worker, double bytes, double seconds)
+{
+	struct link *link;
+
+	if (bytes < LINK_BYTES || !(seconds > 0))
+		return;
+	pthread_mutex_lock(&supervise->lock);
+	link = find_link(supervise, worker->place.host);
+	if (link == NULL) {
+		link = &supervise->links[supervise->links_known++ % LINKS_MAX];
+		*link = (struct link){.speed = bytes / seconds};
+		snprintf(link->host, sizeof(link->host), "%s", worker->place.host);
+	}
+	link->speed += LINK_SHARE * (bytes / seconds - link->speed);
+	pthread_mutex_unlock(&supervise->lock);
+}
+
+double supervise_link(struct supervise *supervise, const char *host)
+{
+	const struct link *link;
+	double speed;
+
+	pthread_mutex_lock(&supervise->lock);
+	link = find_link(supervise, host);
+	speed = link != NULL ? link->speed : 0;
+	pthread_mutex_unlock(&supervise->lock);
+	return speed;
 }
 
 bool remote_fits(const struct worker *worker, const struct job_trial *trial)

@@ -114,6 +114,9 @@ enum { TROUBLES_MAX = 16 };
 /* Returns how many there are: each host's last, of the last two minutes. */
 int supervise_troubles(struct supervise *supervise, struct host_trouble ret_troubles[TROUBLES_MAX]);
 
+/* Bytes a second that went to that host when projections were sent there last; 0: not known. */
+double supervise_link(struct supervise *supervise, const char *host);
+
 /* A copy of what is known of one worker, for GET /v1/devices, /readyz and /metrics. */
 enum worker_state {
 	WORKER_ABSENT,

@@ -100,10 +100,12 @@ bool job_attendable(struct job *job, struct scan_facts *ret_facts)
 	return ret_facts->convertible && !ret_facts->complete && ret_facts->checked;
 }
 
-/* A job that may have no device here goes to the place that has claimed it alone. jobs->lock is held. */
-static bool passes(const struct job *job, const struct job_filter *filter)
+/* A job that may have no device here, or is kept for other hosts, goes to the place that has claimed it alone.
+ * jobs->lock is held. */
+static bool passes(struct job *job, const struct job_filter *filter)
 {
-	if (job->entry.elsewhere && job->trial.place == 0)
+	if (job->trial.place == 0 &&
+	    (job->entry.elsewhere || (job->entry.queued && job_is_kept_away(job, clock_monotonic()))))
 		return false;
 	return filter == NULL || filter->fits(filter->context, &job->trial);
 }

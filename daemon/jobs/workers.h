@@ -22,6 +22,7 @@
 enum {
 	WORKERS_MAX = 64, /* devices; one more may stand for the processor, and others for other hosts */
 	SLOTS_MAX = WORKERS_MAX + 1 + PLACES_MAX,
+	LINKS_MAX = 64,  /* hosts whose links are known */
 	CRASHES_MAX = 3, /* times that a worker may fail to read or write for a job */
 };
 #define NEVER 1e300     /* a time of clock_monotonic that does not come */
@@ -139,7 +140,7 @@ struct supervise {
 	double memory[WORKERS_MAX];       /* devices_memory, as the jobs were told of last; the thread's own */
 	int memory_count;                 /* -1: not yet */
 	double dispatch_at;               /* monotonic; the thread's own */
-	double kept_until; /* monotonic: when a job that waits for devices waits no longer; 0: none does */
+	double kept_until; /* monotonic: when a job that waits for devices, or for other hosts, waits no longer; 0 */
 	double review_at;  /* monotonic: when jobs that are held are looked at, 0: none; its own */
 	double stop_by;    /* monotonic: the stop's end, NEVER before it; the thread's own */
 
@@ -151,6 +152,11 @@ struct supervise {
 	struct place places[PLACES_MAX], spent[PLACES_MAX];
 	int place_count, spent_count;
 	struct host_trouble troubles[TROUBLES_MAX];
+	struct link {
+		char host[64];
+		double speed; /* bytes a second, smoothed */
+	} links[LINKS_MAX];
+	int links_known;          /* of all hosts that there ever were */
 	unsigned long long clear; /* bit for each worker that an operator wants cleared */
 	bool stop;
 };
@@ -264,6 +270,8 @@ void remote_spend(struct supervise *supervise, struct worker *worker);
 bool remote_fits(const struct worker *worker, const struct job_trial *trial);
 /* Why the host of this slot's place cannot be given its job; NULL: it can. */
 void remote_trouble(struct supervise *supervise, const struct worker *worker, const char *why);
+/* So many bytes went to the host of this slot's place in so many seconds. */
+void remote_measure(struct supervise *supervise, const struct worker *worker, double bytes, double seconds);
 /* How a run on another host ends for its job: what fails there is no failure of the job. */
 enum worker_end remote_end(const struct worker *worker, enum worker_end end, int code);
 

@@ -63,8 +63,13 @@ int ledger_check(const struct ledger_options *options, struct error *err) LEDGER
 int ledger_open(const struct ledger_options *options, struct ledger **ret_ledger, struct error *err) LEDGER_WEAK;
 void ledger_close(struct ledger *ledger) LEDGER_WEAK; /* NULL is fine */
 
-/* This host is there, with devices of memory[count] bytes: to be called at least every third of a lease. */
-int ledger_seen(struct ledger *ledger, const double *memory, int count, struct error *err) LEDGER_WEAK;
+/*
+ * This host is there, with devices of memory[count] bytes: to be called at least every third of a lease. rates: what
+ * jobs have taken there, as hosts understand it, shorter than LEDGER_RATES_SIZE; "": what was told before stands.
+ */
+enum { LEDGER_RATES_SIZE = 3072 };
+int ledger_seen(struct ledger *ledger, const double *memory, int count, const char *rates,
+		struct error *err) LEDGER_WEAK;
 
 /* ---- which host has what ---- */
 struct fleet_host {
@@ -74,6 +79,7 @@ struct fleet_host {
 	double unseen;                     /* s since it was seen last */
 	double memory[WHERE_DEVICES_MOST]; /* bytes of each of its devices */
 	int devices;
+	char rates[LEDGER_RATES_SIZE];
 };
 /* The ids of this host's scans and jobs are these, at most HOMES_MOST. */
 enum { HOMES_MOST = 4096 };

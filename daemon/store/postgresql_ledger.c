@@ -65,7 +65,8 @@ static int make_tables(struct ledger *ledger, struct error *err)
 		 " ADD COLUMN IF NOT EXISTS memory double precision NOT NULL DEFAULT 0,"
 		 " ADD COLUMN IF NOT EXISTS devices bigint NOT NULL DEFAULT 0;"
 		 "ALTER TABLE hosts ADD COLUMN IF NOT EXISTS changes bigint NOT NULL DEFAULT 0,"
-		 " ADD COLUMN IF NOT EXISTS memory text NOT NULL DEFAULT '{}';"
+		 " ADD COLUMN IF NOT EXISTS memory text NOT NULL DEFAULT '{}',"
+		 " ADD COLUMN IF NOT EXISTS rates text NOT NULL DEFAULT '';"
 		 "CREATE TABLE IF NOT EXISTS homes (id text COLLATE \"C\" PRIMARY KEY, owner text NOT NULL);"
 		 "CREATE INDEX IF NOT EXISTS homes_of ON homes (owner);"
 		 "COMMIT",
@@ -122,7 +123,7 @@ static int join(struct ledger *ledger, struct error *err)
 	snprintf(sql, sizeof(sql), "LISTEN %s", ledger->schema);
 	if (code == 0)
 		code = session_execute(&ledger->session, sql, NULL, err);
-	return code == 0 ? ledger_seen(ledger, NULL, 0, err) : code;
+	return code == 0 ? ledger_seen(ledger, NULL, 0, "", err) : code;
 }
 
 int ledger_open(const struct ledger_options *options, struct ledger **ret_ledger, struct error *err)
@@ -189,18 +190,20 @@ static int read_array(const char *text, double ret_numbers[WHERE_DEVICES_MOST])
 	return count;
 }
 
-int ledger_seen(struct ledger *ledger, const double *memory, int count, struct error *err)
+int ledger_seen(struct ledger *ledger, const double *memory, int count, const char *rates, struct error *err)
 {
-	struct value values[] = {text_value(ledger->host), text_value(ledger->url), text_value("")};
+	struct value values[] = {text_value(ledger->host), text_value(ledger->url), text_value(""), text_value(rates)};
 	char array[ARRAY_SIZE];
 
 	print_array(memory, count, array);
 	values[2] = text_value(array);
 	return session_run(&ledger->session,
-			   "INSERT INTO hosts (name, url, seen, memory) VALUES ($1::text, $2::text, now(), $3::text)"
+			   "INSERT INTO hosts (name, url, seen, memory, rates)"
+			   " VALUES ($1::text, $2::text, now(), $3::text, $4::text)"
 			   " ON CONFLICT (name) DO UPDATE SET url = excluded.url, seen = excluded.seen,"
-			   " memory = excluded.memory",
-			   values, 3, NULL, NULL, err);
+			   " memory = excluded.memory,"
+			   " rates = CASE WHEN excluded.rates = '' THEN hosts.rates ELSE excluded.rates END",
+			   values, 4, NULL, NULL, err);
 }
 
 /* ---- claims as rows ---- */
@@ -294,6 +297,7 @@ static int note_host(void *context, const struct value *values, struct error *er
 	snprintf(host->url, sizeof(host->url), "%s", (const char *)values[1].bytes);
 	host->unseen = values[4].real;
 	host->devices = read_array(values[5].bytes, host->memory);
+	snprintf(host->rates, sizeof(host->rates), "%s", (const char *)values[6].bytes);
 	hosts->count++;
 	return 0;
 }
@@ -304,7 +308,7 @@ int ledger_hosts(struct ledger *ledger, struct fleet_host *ret_hosts, int most, 
 	struct hosts hosts = {.hosts = ret_hosts, .most = most};
 	int code = session_run(&ledger->session,
 			       "SELECT name, url, changes, CASE WHEN seen > now() - $2::float8 * interval '1 second'"
-			       " THEN 0::bigint ELSE 1 END, extract(epoch FROM now() - seen)::float8, memory"
+			       " THEN 0::bigint ELSE 1 END, extract(epoch FROM now() - seen)::float8, memory, rates"
 			       " FROM hosts WHERE name <> $1::text ORDER BY seen DESC",
 			       values, 2, note_host, &hosts, err);
 

@@ -442,6 +442,57 @@ test_a_job_on_several_devices_goes_where_they_are_and_why_one_waits_is_told() {
 	stop_daemon
 }
 
+# paced NAME SECONDS [OPTION ...]: a host whose worker takes that long for jobs of 4 and of 60 iterations
+paced() { PACED_WORKER=$BUILD/cbct-worker PACED_SECONDS="4:$2,60:$(($2 * 15))" start_host "$1" --worker "$top/tests/bench/paced_worker.py" "${@:3}"; }
+runs_on() { # PATTERN of jq on the device: $job runs
+	local i
+	for ((i = 0; i < 1200; i++)); do
+		req GET "/v1/jobs/$job"
+		[ "$(json '.state == "running" or .state == "succeeded"')" = true ] && break
+		sleep 0.05
+	done
+	[ "$(json ".device | $1")" = true ]
+}
+cancel_it() {
+	req DELETE "/v1/jobs/$job"
+	wait_job cancelled
+}
+test_large_jobs_go_to_a_faster_host_and_small_ones_stay_on_the_cart() {
+	local try
+	local some="{\"scan\": \"SCAN\", $grid, \"fdk\": {}, \"sart\": {\"iterations\": X, \"subsets\": 1}, \"emit\": []}"
+	begin
+	paced a 0 --fleet-address http://127.0.0.1:PORT
+	paced c 4
+	at c
+	post_scan "$scan_dir"
+	post_projections "$scan_dir"
+	# What such jobs take is learned on either.
+	post_job "$(where '{"host": "c"}' "${some/X/4}")"
+	wait_job succeeded
+	post_job "$(where '{"host": "a"}' "${some/X/4}")"
+	wait_job succeeded
+	for ((try = 0; try < 5; try++)); do
+		sleep 1
+		post_job "${some/X/60}"
+		runs_on 'startswith("a: ")' && break
+		cancel_it # it was not known here yet
+	done
+	wait_job succeeded
+	expect_json '.device | startswith("a: ")'
+	post_job "${some/X/1}"
+	wait_job succeeded
+	expect_json '.device | startswith("a: ") | not'
+	# Where bringing it takes longer than all of it here, it stays.
+	stop_host c
+	paced c 4 --fleet-link 1K
+	at c
+	sleep 2
+	post_job "${some/X/60}"
+	runs_on 'startswith("a: ") | not' || fail "it stays, got $(json .device)"
+	cancel_it
+	[ "$(sql "SELECT rates <> '' FROM cbctd_fleet_test.hosts WHERE name = 'c'")" = t ] || fail "what jobs take on c is told"
+}
+
 test_a_job_runs_where_it_says_and_waits_for_a_host_that_is_not_there() {
 	local absent
 	begin

@@ -121,7 +121,7 @@ static void seen(struct ledger *ledger)
 {
 	struct error err = {0};
 
-	ck_assert_msg(ledger_seen(ledger, NULL, 0, &err) == 0, "%s", err.text);
+	ck_assert_msg(ledger_seen(ledger, NULL, 0, "", &err) == 0, "%s", err.text);
 }
 
 static void sleep_for(double seconds)
