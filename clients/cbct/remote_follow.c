@@ -209,15 +209,21 @@ static int keep_checkpoint(struct remote *remote, struct error *err)
 	return code == 0 ? remote_tell(remote, &message, err) : code;
 }
 
-/* A job that has been sent all that it needs, and still waits: something was lost there. */
-static int heed_waiting(struct remote *remote, bool waits, struct error *err)
+/*
+ * A job that has been sent all that it needs, still waits, and takes none of it in: something was lost there. One whose
+ * worker is slower than the way waits until it has come to the last.
+ */
+static int heed_waiting(struct remote *remote, const cJSON *job, bool waits, struct error *err)
 {
+	const int taken = (int)member_number(cJSON_GetObjectItemCaseSensitive(job, "views"), "reconstructed", 0);
+
 	if (!waits || remote->sent < remote->files.scan->count) {
 		remote->waits = 0;
 		return 0;
 	}
-	if (remote->waits == 0)
+	if (remote->waits == 0 || taken != remote->taken)
 		remote->waits = clock_monotonic();
+	remote->taken = taken;
 	return clock_monotonic() < remote->waits + remote->options->lease
 		   ? 0
 		   : error_set(err, ERR_BUSY, "on %.60s something of it was lost", remote->options->host);
@@ -253,7 +259,7 @@ int remote_follow(struct remote *remote, bool *ret_done, struct error *err)
 	if (code == 0 && all)
 		code = keep_checkpoint(remote, err);
 	if (code == 0)
-		code = heed_waiting(remote, strcmp(state, "waiting") == 0, err);
+		code = heed_waiting(remote, job, strcmp(state, "waiting") == 0, err);
 	if (code == 0 && strcmp(state, "running") == 0)
 		remote_fetch_checkpoint(remote->http, remote->job, remote->start, &remote->checkpoint);
 	*ret_done = code == 0 && all && strcmp(state, "succeeded") == 0 && remote->volumes > 0;

@@ -17,7 +17,9 @@ enum { GIVEN_BACK_MOST = 10 };
 static const double LINK_BYTES = 1e6;   /* of fewer the time is that of a request, and says nothing of the link */
 static const double LINK_SHARE = 0.3;   /* of the last step in what is known of a link */
 static const double TROUBLE_KEPT = 120; /* s: longer than a job that comes back stays with nobody */
-static const double TIDY = 5;           /* s that a process has behind its job to remove it from the other host */
+/* s that a process has to leave a host that has lost its job: it may wait for that host, and has nothing to lose. */
+static const double LEAVE = 0.5;
+static const double TIDY = 5; /* s that a process has behind its job to remove it from the other host */
 
 static const struct place *find_place(const struct place *places, int count, long long number)
 {
@@ -85,7 +87,7 @@ static void leave(struct supervise *supervise, struct worker *worker)
 		log_line(LEVEL_INFO, "job %s is taken back from %s", worker->place.job, worker->place.host);
 		worker_order(worker, MESSAGE_YIELD);
 		worker->yielding = true;
-		worker->deadline = clock_monotonic() + EXIT;
+		worker->deadline = clock_monotonic() + LEAVE;
 		break;
 	case WORKER_STARTING:
 	case WORKER_IDLE:
