@@ -19,8 +19,10 @@
 #include "core/recon/algorithm.h"
 #include "core/correct/rings.h"
 #include "core/correct/scatter_images.h"
+#include "core/correct/shadow.h"
 #include "core/correct/stuck.h"
 #include "core/pulse.h"
+#include "core/scan/crop.h"
 #include "proto/checkpoint.h"
 #include "proto/durable.h"
 #include "proto/format.h"
@@ -398,6 +400,11 @@ struct reconstruction {
 	struct linearise linearise;
 	/* Looks for stuck pixels in the views as they pass; NULL before the recon is opened, and where too few are. */
 	struct stuck *stuck;
+	/* Looks for shadows in the same views. Where there are any, the lit part is the detector, images included. */
+	struct shadow *shadow;
+	struct pixel_area lit;
+	struct geometry lit_geometry; /* owned; no views: all of the detector is lit */
+	void *lit_image[IMAGE_COUNT], *lit_stuck;
 	struct scatter_file scatter; /* where the scan has images of it */
 	int *scattered;              /* [images], the projections that have one */
 	struct scatter_source scatter_source;
@@ -413,6 +420,13 @@ static int projection_of(const struct reconstruction *reconstruction, int view)
 	const int *projection = reconstruction->files.scan->projection;
 
 	return projection == NULL ? view : projection[view];
+}
+
+/* Of the detector that the views are taken from. */
+static const struct geometry *detector_geometry(const struct reconstruction *reconstruction)
+{
+	return reconstruction->lit_geometry.views != NULL ? &reconstruction->lit_geometry
+							  : &reconstruction->files.scan->geometry;
 }
 
 static int allocate(struct reconstruction *reconstruction, struct error *err)
@@ -537,7 +551,7 @@ static bool looks_for_poses(const struct reconstruction *reconstruction)
 static int open_recon(struct reconstruction *reconstruction, struct error *err)
 {
 	const struct geometry *geometry =
-	    reconstruction->poses.views != NULL ? &reconstruction->poses : &reconstruction->files.scan->geometry;
+	    reconstruction->poses.views != NULL ? &reconstruction->poses : detector_geometry(reconstruction);
 	struct recipe recipe = *reconstruction->options->recipe;
 	int code;
 
@@ -573,6 +587,8 @@ static int open_first(struct reconstruction *reconstruction, struct error *err)
 	if (code == 0)
 		code = stuck_new(&reconstruction->linearise, geometry, reconstruction->backend != &backend_cpu,
 				 &reconstruction->stuck, err);
+	if (code == 0 && reconstruction->stuck != NULL)
+		code = shadow_new(&reconstruction->linearise, geometry, STUCK_VIEWS, &reconstruction->shadow, err);
 	if (code == 0 && hooks->on_open != NULL)
 		hooks->on_open(hooks->recon.context, recon_memory_taken(reconstruction->recon),
 			       recon_plan(reconstruction->recon));
@@ -584,17 +600,26 @@ static int read_rows(void *context, int view, int first, int rows, void *to, str
 {
 	const struct reconstruction *reconstruction = context;
 	const struct scan_files *files = &reconstruction->files;
-	const size_t bytes = scan_projection_bytes(files->scan), row = bytes / (size_t)files->scan->geometry.rows;
+	const struct geometry *whole = &files->scan->geometry, *lit = detector_geometry(reconstruction);
+	const size_t bytes = scan_projection_bytes(files->scan), row = bytes / (size_t)whole->rows;
+	const size_t pixel = row / (size_t)whole->columns, lit_row = pixel * (size_t)lit->columns;
+	const size_t at = (size_t)projection_of(reconstruction, view) * bytes +
+			  row * (size_t)(reconstruction->lit.first[1] + first) +
+			  pixel * (size_t)reconstruction->lit.first[0];
+	int code = 0;
 
-	return file_read_at(files->projections, to, row * (size_t)rows,
-			    (size_t)projection_of(reconstruction, view) * bytes + row * (size_t)first,
-			    "projections.raw", err);
+	if (lit_row == row)
+		return file_read_at(files->projections, to, row * (size_t)rows, at, "projections.raw", err);
+	for (int i = 0; i < rows && code == 0; i++)
+		code = file_read_at(files->projections, (char *)to + (size_t)i * lit_row, lit_row, at + (size_t)i * row,
+				    "projections.raw", err);
+	return code;
 }
 
 /* Looks for errors of pixels' gain, beside the stuck ones; with an image that has them they are gone from counts. */
 static int look_for_rings(struct reconstruction *reconstruction, struct error *err)
 {
-	const struct geometry *geometry = &reconstruction->files.scan->geometry;
+	const struct geometry *geometry = detector_geometry(reconstruction);
 	const size_t pixels = (size_t)geometry->columns * (size_t)geometry->rows;
 	const struct rings_source source = {read_rows, reconstruction};
 	const struct cancel cancel = {run_cancelled, &reconstruction->run};
@@ -635,9 +660,134 @@ static bool looks_for_rings(const struct reconstruction *reconstruction)
 	return reconstruction->options->recipe->rings;
 }
 
+/* ---- edges of the detector in shadow ---- */
+
+static int crop_image(const struct reconstruction *reconstruction, const void *image, size_t pixel_bytes,
+		      void **ret_cropped, struct error *err)
+{
+	const struct pixel_area *lit = &reconstruction->lit;
+
+	*ret_cropped = malloc((size_t)lit->count[0] * (size_t)lit->count[1] * pixel_bytes);
+	if (*ret_cropped == NULL)
+		return error_set(err, ERR_NO_MEMORY, "no memory for an image of %d x %d pixels", lit->count[0],
+				 lit->count[1]);
+	pixels_crop(image, pixel_bytes, reconstruction->files.scan->geometry.columns, lit, *ret_cropped);
+	return 0;
+}
+
+/* Pixels beside a border that are held against those in shadow follow them badly; none of these is stuck. */
+static void forget_stuck_beside(const struct shadow_found *found, const struct pixel_area *lit, unsigned char *map)
+{
+	enum { BESIDE = 3 };
+
+	for (int row = 0; row < lit->count[1]; row++)
+		for (int column = 0; column < lit->count[0]; column++)
+			if ((found->before[0] > 0 && column < BESIDE) || (found->before[1] > 0 && row < BESIDE) ||
+			    (found->behind[0] > 0 && column >= lit->count[0] - BESIDE) ||
+			    (found->behind[1] > 0 && row >= lit->count[1] - BESIDE))
+				map[(size_t)row * (size_t)lit->count[0] + (size_t)column] = 0;
+}
+
+/* An air region becomes its lit part; one without any is none. */
+static void crop_region(const struct pixel_area *lit, struct linearise *linearise)
+{
+	for (int i = 0; i < 2; i++) {
+		const int from = linearise->air_region[i] - lit->first[i];
+		const int to = linearise->air_region[2 + i] - lit->first[i];
+
+		linearise->has_air_region = linearise->has_air_region && to >= 0 && from < lit->count[i];
+		linearise->air_region[i] = from > 0 ? from : 0;
+		linearise->air_region[2 + i] = to < lit->count[i] ? to : lit->count[i] - 1;
+	}
+}
+
+/* The images and the geometry of what is lit. */
+static int crop_detector(struct reconstruction *reconstruction, const struct shadow_found *found, struct error *err)
+{
+	const struct geometry *whole = &reconstruction->files.scan->geometry;
+	struct linearise *linearise = &reconstruction->linearise;
+	struct pixel_area *lit = &reconstruction->lit;
+	int code = 0;
+
+	*lit = (struct pixel_area){
+	    {found->before[0], found->before[1]},
+	    {whole->columns - found->before[0] - found->behind[0], whole->rows - found->before[1] - found->behind[1]}};
+	for (int i = 0; i < IMAGE_COUNT && code == 0; i++) {
+		if (linearise->image[i] == NULL)
+			continue;
+		code = crop_image(reconstruction, linearise->image[i], image_bytes(i, 1, 1),
+				  &reconstruction->lit_image[i], err);
+		linearise->image[i] = reconstruction->lit_image[i];
+	}
+	if (code == 0 && linearise->stuck != NULL) {
+		code = crop_image(reconstruction, linearise->stuck, 1, &reconstruction->lit_stuck, err);
+		linearise->stuck = reconstruction->lit_stuck;
+		if (code == 0)
+			forget_stuck_beside(found, lit, reconstruction->lit_stuck);
+	}
+	crop_region(lit, linearise);
+	memcpy(reconstruction->scatter_source.outside,
+	       (int[]){found->before[0], found->behind[0], found->before[1], found->behind[1]},
+	       sizeof(reconstruction->scatter_source.outside));
+	return code == 0 ? geometry_crop(&reconstruction->lit_geometry, whole, lit, err) : code;
+}
+
+/* "the first 12 and the last 9 of 80 columns"; empty where none is in shadow. */
+static void describe_shadow(int before, int behind, int all, const char *name, char *ret, size_t size)
+{
+	if (before > 0 && behind > 0)
+		snprintf(ret, size, "the first %d and the last %d of %d %s", before, behind, all, name);
+	else if (before > 0 || behind > 0)
+		snprintf(ret, size, "the %s %d of %d %s", before > 0 ? "first" : "last", before + behind, all, name);
+	else
+		ret[0] = 0;
+}
+
+static void tell_shadow(struct reconstruction *reconstruction, const struct shadow_found *found)
+{
+	const struct geometry *whole = &reconstruction->files.scan->geometry;
+	char columns[80], rows[80], detail[360];
+
+	describe_shadow(found->before[0], found->behind[0], whole->columns, "columns", columns, sizeof(columns));
+	describe_shadow(found->before[1], found->behind[1], whole->rows, "rows", rows, sizeof(rows));
+	snprintf(
+	    detail, sizeof(detail),
+	    "%s%s%s are darker than those beside them, by line integrals of %.2g to %.2g, in all of %d projections "
+	    "looked at, and not in the flat image: they were left out",
+	    columns, columns[0] != 0 && rows[0] != 0 ? " and " : "", rows, (double)found->least, (double)found->most,
+	    found->views);
+	run_warning(&reconstruction->run, "detector_shadow", detail);
+}
+
+/* Looks for edges in shadow, and takes what is lit for the detector. */
+static int look_for_shadow(struct reconstruction *reconstruction, struct error *err)
+{
+	struct shadow_found found;
+	int code = reconstruction->shadow != NULL ? shadow_find(reconstruction->shadow, &found, err) : 0;
+
+	if (code <= 0)
+		return code;
+	tell_shadow(reconstruction, &found);
+	return crop_detector(reconstruction, &found, err);
+}
+
+/* The lit parts of a batch, one after the other. */
+static void crop_samples(struct reconstruction *reconstruction, int count)
+{
+	const size_t bytes = scan_projection_bytes(reconstruction->files.scan);
+	const struct geometry *whole = &reconstruction->files.scan->geometry;
+	const size_t pixel = bytes / ((size_t)whole->columns * (size_t)whole->rows);
+	const size_t lit = (size_t)reconstruction->lit.count[0] * (size_t)reconstruction->lit.count[1] * pixel;
+
+	for (int i = 0; i < count; i++)
+		pixels_crop(reconstruction->samples + (size_t)i * bytes, pixel, whole->columns, &reconstruction->lit,
+			    reconstruction->samples + (size_t)i * lit);
+}
+
 /*
- * Called once all views that tell of pixels have come. Where pixels are stuck, or have another gain, the reconstruction
- * is opened anew without them, *ret_again, and has none of the projections: earlier ones went in with these pixels.
+ * Called once all views that tell of pixels have come. Where pixels are stuck or in shadow, or have another gain, the
+ * reconstruction is opened anew without them, *ret_again, and has none of the projections: earlier ones went in with
+ * these pixels.
  */
 static int heed_pixels(struct reconstruction *reconstruction, bool *ret_again, struct error *err)
 {
@@ -649,10 +799,11 @@ static int heed_pixels(struct reconstruction *reconstruction, bool *ret_again, s
 	reconstruction->looked = true;
 	if (reconstruction->stuck != NULL)
 		reconstruction->linearise.stuck = stuck_find(reconstruction->stuck);
-	if (looks_for_rings(reconstruction))
+	code = look_for_shadow(reconstruction, err);
+	if (code == 0 && looks_for_rings(reconstruction))
 		code = look_for_rings(reconstruction, err);
-	*ret_again =
-	    reconstruction->linearise.stuck != NULL || reconstruction->flat != NULL || reconstruction->errors != NULL;
+	*ret_again = reconstruction->linearise.stuck != NULL || reconstruction->flat != NULL ||
+		     reconstruction->errors != NULL || reconstruction->lit_geometry.views != NULL;
 	if (code < 0 || !*ret_again)
 		return code;
 	return open_again(reconstruction, err);
@@ -904,6 +1055,11 @@ void reconstruction_close(struct reconstruction *reconstruction)
 	provenance_clear(&reconstruction->run.provenance);
 	recon_free(reconstruction->recon);
 	stuck_free(reconstruction->stuck);
+	shadow_free(reconstruction->shadow);
+	geometry_clear(&reconstruction->lit_geometry);
+	for (int i = 0; i < IMAGE_COUNT; i++)
+		free(reconstruction->lit_image[i]);
+	free(reconstruction->lit_stuck);
 	free(reconstruction->errors);
 	free(reconstruction->flat);
 	geometry_clear(&reconstruction->poses);
@@ -1030,12 +1186,20 @@ static int read_views(struct reconstruction *reconstruction, int view, int count
 /* Line integrals are float32, and no flat image is held against them. */
 static void take_errors_off(struct reconstruction *reconstruction, int count)
 {
-	const struct geometry *geometry = &reconstruction->files.scan->geometry;
+	const struct geometry *geometry = detector_geometry(reconstruction);
 	const size_t pixels = (size_t)geometry->columns * (size_t)geometry->rows;
 	float *samples = (float *)reconstruction->samples;
 
 	for (int i = 0; i < count; i++)
 		algebra_axpby(pixels, -1, reconstruction->errors, 1, samples + (size_t)i * pixels);
+}
+
+/* Looks at the pixels of a view, one of those that stuck_wants. */
+static void look_at_pixels(struct reconstruction *reconstruction, const void *samples)
+{
+	stuck_add(reconstruction->stuck, samples);
+	if (reconstruction->shadow != NULL)
+		shadow_add(reconstruction->shadow, samples);
 }
 
 /* At most a batch. */
@@ -1051,7 +1215,9 @@ static int push_some(struct reconstruction *reconstruction, int count, struct er
 		reconstruction->views[i] = reconstruction->pushed + i;
 	for (int i = 0; i < count && code == 0 && reconstruction->stuck != NULL && !reconstruction->looked; i++)
 		if (stuck_wants(reconstruction->stuck, reconstruction->views[i]))
-			stuck_add(reconstruction->stuck, reconstruction->samples + (size_t)i * bytes);
+			look_at_pixels(reconstruction, reconstruction->samples + (size_t)i * bytes);
+	if (code == 0 && reconstruction->lit_geometry.views != NULL)
+		crop_samples(reconstruction, count);
 	if (code == 0 && reconstruction->errors != NULL)
 		take_errors_off(reconstruction, count);
 	if (code == 0)
@@ -1092,7 +1258,7 @@ static int look_ahead(struct reconstruction *reconstruction, struct error *err)
 			continue;
 		code = read_views(reconstruction, i, 1, err);
 		if (code == 0)
-			stuck_add(reconstruction->stuck, reconstruction->samples);
+			look_at_pixels(reconstruction, reconstruction->samples);
 	}
 	return code == 0 ? heed_pixels(reconstruction, &again, err) : code;
 }

@@ -70,9 +70,9 @@ daemon_rooms=("http:" "store:" "volumes: store" "jobs: store" "calibrations: sto
 	"api: http store volumes jobs calibrations sendings fleet intake")
 declare -A doors=(
 	[daemon/store]="store|ledger"
-	[core/scan]="geometry|grid|image|orbit|phantom"
+	[core/scan]="crop|geometry|grid|image|orbit|phantom"
 	[core/cpu]="none"
-	[core/correct]="averaging|correction|counts|images|input|lag|projection_noise|rings|scatter|scatter_images|stuck"
+	[core/correct]="averaging|correction|counts|images|input|lag|projection_noise|rings|scatter|scatter_images|shadow|stuck"
 	[core/refine]="agreement|reduced|refine"
 	[core/fit]="hardening|lag|scatter"
 	[core/recon]="algorithm|parameters|quality|recipe|recon|self_test"

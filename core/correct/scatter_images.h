@@ -16,6 +16,11 @@ struct scatter_source {
 	void *context;
 	const int *projections; /* [count], rising: the numbers of those that have an image */
 	int count;
+	/*
+	 * Columns before and behind, and rows before and behind the pixels of the geometry that the detector, and so
+	 * each image, has beside them.
+	 */
+	int outside[4];
 	/* [row][column] of the at-th of them, counts. Called for each when it is wanted, by one thread. */
 	int (*read)(void *context, int at, float *ret_image, struct error *err);
 };

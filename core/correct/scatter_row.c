@@ -67,13 +67,19 @@ static void close_state(void *context)
 static int open_images(const struct input *input, struct state *state, struct error *err)
 {
 	const struct linearise *given = &input->given;
-	const int detector[2] = {input->binning.columns, input->binning.rows};
+	static const int none[4] = {0};
+	const int *outside = given->scatter_source != NULL ? given->scatter_source->outside : none;
+	const int detector[2] = {outside[0] + input->binning.columns + outside[1],
+				 outside[2] + input->binning.rows + outside[3]};
+	struct pixel_blocks blocks = input->binning.blocks;
 
 	state->sums = malloc((size_t)input->rows * 2 * sizeof(*state->sums));
 	if (state->sums == NULL)
 		return error_set(err, ERR_NO_MEMORY, "no memory for %d rows", input->rows);
-	return scatter_stack_new(&given->scatter->images, given->scatter_source, &input->binning.blocks, detector,
-				 &state->images, err);
+	blocks.first[0] += outside[0];
+	blocks.first[1] += outside[2];
+	return scatter_stack_new(&given->scatter->images, given->scatter_source, &blocks, detector, &state->images,
+				 err);
 }
 
 static int open_estimate(const struct correction_job *job, struct state *state, struct error *err)

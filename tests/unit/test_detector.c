@@ -524,7 +524,8 @@ static void make_images(const struct scene *scene, const float *counts, struct g
 			    (COARSE * COARSE);
 		}
 	}
-	ret->source = (struct scatter_source){ret, ret->projections, count, read_given};
+	ret->source = (struct scatter_source){
+	    .context = ret, .projections = ret->projections, .count = count, .read = read_given};
 }
 
 static struct linearise with_images(const struct given_images *given)
@@ -602,7 +603,7 @@ static double mean_place(int first, int n, double most)
 START_TEST(images_of_scatter_are_linear_in_between)
 {
 	const int numbers[] = {10, 20, 40}, detector[] = {WIDE, HIGH}, n = _i + 1;
-	const struct scatter_source source = {NULL, numbers, 3, plane};
+	const struct scatter_source source = {.projections = numbers, .count = 3, .read = plane};
 	const struct pixel_blocks blocks = {{n, n}, {_i, 0}, {WIDE / n - 1, HIGH / n}};
 	/* Projections and what 100 times the image's place becomes, also backwards and beyond the first and the last.
 	 */
@@ -668,7 +669,7 @@ START_TEST(a_block_has_the_mean_scatter_of_its_pixels)
 {
 	const int number = 0, detector[] = {WIDE, HIGH}, n = 2 + _i;
 	const struct scatter_images images = {WIDE, HIGH, 1};
-	const struct scatter_source source = {NULL, &number, 1, rough};
+	const struct scatter_source source = {.projections = &number, .count = 1, .read = rough};
 	const struct pixel_blocks blocks = {{n, n}, {1, 0}, {(WIDE - 1) / n, HIGH / n}};
 	float fine[WIDE * HIGH], row[WIDE];
 	struct scatter_stack *stack;

@@ -528,6 +528,7 @@ export const strings = {
 	'The object moved during the sweep; its motion was found from the projections.': 'Das Objekt hat sich während der Aufnahme bewegt; seine Bewegung wurde aus den Projektionen gefunden.',
 	'The geometry was kept as it is: no other one fits the projections better.': 'Die Geometrie blieb, wie sie ist: Keine andere passt besser zu den Projektionen.',
 	'Some pixels of the detector had changed since it was calibrated, and were corrected.': 'Einige Pixel des Detektors hatten sich seit der Kalibrierung verändert und wurden ausgeglichen.',
+	'The edge of the detector lay in shadow in all projections, as behind a collimator, and the flat image does not show that: it was left out, and the image shows less than the scan should.': 'Der Rand des Detektors lag in allen Projektionen im Schatten, wie hinter einer Blende, und das Hellbild zeigt das nicht: Er blieb weg, und das Bild zeigt weniger, als der Scan sollte.',
 	'Some pixels of the detector do not follow the others and were replaced from their neighbours.': 'Einige Pixel des Detektors folgen den anderen nicht und wurden aus ihren Nachbarn ersetzt.',
 	'Some samples could not be used and were replaced from their neighbours.': 'Einige Messwerte waren nicht brauchbar und wurden aus ihren Nachbarn ersetzt.',
 	'Some projections are empty or show nothing, and were left out.': 'Einige Projektionen sind leer oder zeigen nichts und blieben weg.',
