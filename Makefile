@@ -265,8 +265,15 @@ $(BUILD)/gpu_ceilings: tests/bench/gpu_ceilings.cu
 apt_install = { $$run apt-get install -y -qq --no-install-recommends $(1) >/dev/null 2>&1 || \
 	  { $$run apt-get update -qq && DEBIAN_FRONTEND=noninteractive $$run apt-get install -y -qq --no-install-recommends $(1) >/dev/null; }; }
 
-check: OPTIONAL += pg_config:libpq-dev pg_ctlcluster:postgresql
-check: OPTIONAL += ip:iproute2 g++:g++ /usr/include/dcmtk/dcmnet/scu.h:libdcmtk-dev chromium:chromium dciodvfy:dicom3tools Orthanc:orthanc-dicomweb /usr/share/orthanc/plugins/libOrthancWebViewer.so:orthanc-webviewer promtool:prometheus systemd-analyze:systemd
+install_optional = wanted=""; for pair in $(1); do command -v $${pair%%:*} >/dev/null 2>&1 || [ -e $${pair%%:*} ] || wanted="$$wanted $${pair\#\#*:}"; done; \
+	[ -z "$$wanted" ] && exit 0; \
+	run=""; [ "$$(id -u)" = 0 ] || run="sudo -n"; \
+	echo "installing:$$wanted"; \
+	$(call apt_install,$$wanted) || echo "going on without$$wanted: apt-get cannot install them here" >&2
+
+check: OPTIONAL += pg_config:libpq-dev g++:g++ /usr/include/dcmtk/dcmnet/scu.h:libdcmtk-dev
+# What tests alone need comes while the programs are compiled.
+for_tests := pg_ctlcluster:postgresql ip:iproute2 chromium:chromium dciodvfy:dicom3tools Orthanc:orthanc-dicomweb /usr/share/orthanc/plugins/libOrthancWebViewer.so:orthanc-webviewer promtool:prometheus systemd-analyze:systemd
 check: MODULES += matplotlib:python3-matplotlib nibabel:python3-nibabel pydicom:python3-pydicom gdcm:python3-gdcm h5py:python3-h5py olefile:python3-olefile odil:python3-odil
 setup: ## install the Debian packages that are missing
 	@missing=""; \
@@ -279,18 +286,17 @@ setup: ## install the Debian packages that are missing
 	if [ "$$(id -u)" != 0 ] && ! sudo -n true 2>/dev/null; then \
 		echo "please type:  sudo apt-get install -y --no-install-recommends$$missing" >&2; exit 1; fi; \
 	$(call apt_install,$$missing)
-	@wanted=""; for pair in $(OPTIONAL); do command -v $${pair%%:*} >/dev/null 2>&1 || [ -e $${pair%%:*} ] || wanted="$$wanted $${pair##*:}"; done; \
-	[ -z "$$wanted" ] && exit 0; \
-	run=""; [ "$$(id -u)" = 0 ] || run="sudo -n"; \
-	echo "installing:$$wanted"; \
-	$(call apt_install,$$wanted) || echo "going on without$$wanted: apt-get cannot install them here" >&2
+	@$(call install_optional,$(OPTIONAL))
+
+for-tests:
+	@$(call install_optional,$(for_tests))
 
 demo: setup ## a C-arm scan posted with curl, reconstructed, its volumes coming back
 	@$(MAKE) --no-print-directory -j$$(nproc) all
 	@BUILD=$(BUILD) clients/curl/demo.sh
 
 check: setup ## every test; what cannot run here is skipped aloud
-	@$(MAKE) --no-print-directory -j$$(nproc) all test-programs
+	@$(MAKE) --no-print-directory -j$$(($$(nproc) + 1)) for-tests all test-programs
 	@BUILD=$(BUILD) SANITIZED=$(SANITIZED) LEAVE_OUT="$(LEAVE_OUT)" tests/run.sh
 
 soak: setup ## the long tests: faults by the thousand, sweeps over anatomy and noise (an hour and more)
@@ -498,6 +504,6 @@ clean: ## removes build/
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z_.-]+:.*## /{printf "  make %-21s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
 
-.PHONY: all test-programs again setup demo check soak fuzz fuzzers paper paper-report bench bench-agreement bench-refine bench-calibrate bench-denoise bench-presets bench-stopping bench-methods check-gpu bench-gpu asan tsan lint format rooms pictures third-party compile_commands.json install deb container sbom reproducible clean help
+.PHONY: all test-programs for-tests again setup demo check soak fuzz fuzzers paper paper-report bench bench-agreement bench-refine bench-calibrate bench-denoise bench-presets bench-stopping bench-methods check-gpu bench-gpu asan tsan lint format rooms pictures third-party compile_commands.json install deb container sbom reproducible clean help
 .SECONDARY:
 -include $(shell find $(BUILD) -path $(BUILD)/test -prune -o -type f -name '*.d' -print 2>/dev/null)

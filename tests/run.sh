@@ -1,7 +1,8 @@
 #!/usr/bin/env bash
 # Every test: the house's rules, the unit tests and the black-box tests over HTTP, JOBS parts at a time: three more than
 # there are processors, since most of those over HTTP wait four fifths of their time. Unit suites compute, so that they
-# have one place for each processor. What cannot run here is skipped aloud. Closes with `N passed, N failed, N skipped`.
+# have one place for each processor; when there is none left, others have those places too. What cannot run here is
+# skipped aloud. Closes with `N passed, N failed, N skipped`.
 # Usage: tests/run.sh [--soak] [FILTER ...]   only the parts whose path has one of the words in it; --soak: the long
 # tests of tests/soak in place of all others
 set -uo pipefail
@@ -10,6 +11,7 @@ export BUILD=${BUILD:-build}
 # Parts share the processors: threads that wait for others of theirs leave them to the rest, at once.
 export OMP_WAIT_POLICY=${OMP_WAIT_POLICY:-passive}
 processors=$(nproc)
+places_without_suites=${JOBS:-$((2 * processors + 3))}
 JOBS=${JOBS:-$((processors + 3))}
 out=$BUILD/test/parts
 rm -rf "$BUILD"/test/{exchanges,reported.*,parts}
@@ -22,6 +24,7 @@ results=$BUILD/test/results
 if [ "${1:-}" = --soak ]; then
 	shift
 	parts=(tests/soak/test_*.sh)
+	places_without_suites=$JOBS
 else
 	parts=(tests/http/test_real.sh tests/http/test_fleet.sh tests/http/test_restart.sh unit/recon unit/backend unit/outofcore tests/web/test_page.sh
 		unit/study tests/http/test_supervise.sh unit/exterior tests/http/test_arriving.sh lint)
@@ -128,9 +131,10 @@ for part in "${parts[@]}"; do
 	{ [ "$part" = lint ] || [[ $part == unit/* ]] || [ -e "$part" ]; } && wanted "$part" "$@" && waiting+=("$part")
 done
 next_part() { # into part: the first that may begin; 1 where none may
-	local i suites=0
-	[ ${#running[@]} -lt "$JOBS" ] || return 1
+	local i suites=0 places=$JOBS
 	for part in "${running[@]}"; do [[ $part == unit/* ]] && suites=$((suites + 1)); done
+	[[ $suites != 0 || " ${waiting[*]}" == *" unit/"* ]] || places=$places_without_suites
+	[ ${#running[@]} -lt "$places" ] || return 1
 	for i in "${!waiting[@]}"; do
 		part=${waiting[i]}
 		[[ $part == unit/* && $suites -ge $processors ]] && continue

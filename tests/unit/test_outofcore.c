@@ -223,7 +223,7 @@ START_TEST(any_limit_gives_the_same_volume)
 	recipe.algorithm = &algorithm_sart;
 	recipe.iterate.iterations = 1;
 	whole = reconstruct(&scene, &recipe, &linearise, scene.projections, 0);
-	for (size_t limit = whole.memory.total - 1; limit > 1 << 16; limit = limit * 2 / 3) {
+	for (size_t limit = whole.memory.total - 1; limit > 1 << 16; limit /= 2) {
 		const struct device_options options = {.threads = 2, .memory_limit = limit};
 		struct backend backend = backend_cpu;
 		struct recon_memory memory;

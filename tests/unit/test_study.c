@@ -16,6 +16,8 @@
 #include <math.h>
 #include <stdio.h>
 #include <stdlib.h>
+#include <string.h>
+#include <sys/mman.h>
 
 #include "core/recon/algorithm.h"
 #include "tests/unit/scene.h"
@@ -59,15 +61,36 @@ static void study_open(struct study *ret_study, int views, int pixels, int sampl
 	*ret_study = study;
 }
 
+/*
+ * Two tests each have the scan of 100 views and the one of 26, and what they begin with takes longer than most of what
+ * they do. Each test runs in a process of its own: the second takes what the first has left in memory that all share.
+ */
+struct left {
+	bool made;
+	float projections[];
+};
+static const size_t left_bytes = sizeof(struct left) + sizeof(float) * 100 * 169 * 169;
+static struct left *left_by[2]; /* NULL where there was no memory; of fewer than 100 views, of 100 */
+
 static void study_project_voxels(struct study *study)
 {
 	const struct geometry *geometry = &study->scene.geometry;
 	size_t samples = (size_t)geometry->columns * (size_t)geometry->rows;
+	const size_t bytes = sizeof(float) * samples * (size_t)geometry->count;
+	struct left *left = left_by[geometry->count == 100];
 
+	if (left != NULL && left->made) {
+		memcpy(study->scene.projections, left->projections, bytes);
+		return;
+	}
 	/* Ten samples a voxel: halving the step changes no figure here in its third digit. */
 	for (int view = 0; view < geometry->count; view++)
 		volume_project_fine(study->truth, &study->grid, geometry, view, SAMPLE_TRILINEAR,
 				    0.1 * study->grid.spacing[0], study->scene.projections + samples * (size_t)view);
+	if (left != NULL) {
+		memcpy(left->projections, study->scene.projections, bytes);
+		left->made = true;
+	}
 }
 
 static void study_close(struct study *study)
@@ -322,6 +345,11 @@ Suite *study_suite(void)
 	Suite *suite = suite_create("study");
 	TCase *cases = tcase_create("64^3");
 
+	for (int i = 0; i < 2; i++) {
+		void *memory = mmap(NULL, left_bytes, PROT_READ | PROT_WRITE, MAP_SHARED | MAP_ANONYMOUS, -1, 0);
+
+		left_by[i] = memory != MAP_FAILED ? memory : NULL;
+	}
 	tcase_set_timeout(cases, 0);
 	tcase_add_test(cases, sart_takes_the_voxel_object_from_fdk_to_itself);
 	tcase_add_test(cases, conjugate_gradients_and_momentum_pass_a_hundred_iterations_of_sirt);

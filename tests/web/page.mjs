@@ -39,12 +39,12 @@ async function openFinished(options) {
 	return page
 }
 
-/* rules: only those of axe, where the others cannot find anything new. */
-async function accessible(page, what, rules) {
+/* which: those rules of axe that can find anything new, as it takes them. */
+async function accessible(page, what, which = {}) {
 	if (!await page.evaluate('"axe" in window'))
 		await page.evaluate(axe)
-	const violations = await page.evaluate(async runOnly => (await axe.run(document, { resultTypes: ['violations'], selectors: false, ...runOnly && { runOnly } })).violations
-		.map(({ id, nodes: [{ html, failureSummary }] }) => [id, html, failureSummary]), rules)
+	const violations = await page.evaluate(async which => (await axe.run(document, { resultTypes: ['violations'], selectors: false, ...which })).violations
+		.map(({ id, nodes: [{ html, failureSummary }] }) => [id, html, failureSummary]), which)
 	expect(violations.length === 0, `${what} without barriers: ${JSON.stringify(violations)}`)
 }
 
@@ -1178,9 +1178,13 @@ test('no barriers, targets for fingers and nothing covered: every page, at every
 				await page.setViewportSize({ width, height })
 				await page.evaluate(() => new Promise(resolve => requestAnimationFrame(() => requestAnimationFrame(resolve))))
 				await page.emulateMedia({ colorScheme: 'light' })
-				await note(accessible(page, `${what}, light`))
-				await page.emulateMedia({ colorScheme: 'dark' })
-				await note(accessible(page, `${what}, dark`, ['color-contrast'])) /* only colours differ */
+				if (width === 1366) { /* no rule of the style lies between this and 1440: the colours are the same */
+					await note(accessible(page, what, { rules: { 'color-contrast': { enabled: false } } }))
+				} else {
+					await note(accessible(page, `${what}, light`))
+					await page.emulateMedia({ colorScheme: 'dark' })
+					await note(accessible(page, `${what}, dark`, { runOnly: ['color-contrast'] })) /* only colours differ */
+				}
 				await note(fits(page, what))
 				await note(readable(page, what))
 				if (options.hasTouch)
