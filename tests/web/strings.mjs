@@ -35,6 +35,11 @@ for (const file of readdirSync(join(sources, 'lang'))) {
 			missing++
 		}
 	}
+	/* The unit of a label is behind its comma. */
+	for (const label of groups.flatMap(({ fields }) => fields.map(({ label }) => label)).filter(label => strings[label]?.split(', ').length !== label.split(', ').length)) {
+		console.log(`lang/${file}: '${label}' has its unit behind a comma, or none`)
+		missing++
+	}
 	for (const words of Object.keys(strings).filter(words => !text.includes(words.replace(/'/g, '\\\'')) && !words.endsWith('.'))) {
 		console.log(`lang/${file}: nobody says '${words}'`)
 		missing++

@@ -1,7 +1,7 @@
 /* Geometry, grid, times and warnings as lists. */
 import { h, number, duration, bytes, timeElement } from './dom.js'
 import { groups, at, stageText, valueText } from './parameters.js'
-import { t } from './lang.js'
+import { t, inSentence } from './lang.js'
 
 const list = entries => h('dl', {}, entries.filter(entry => entry && entry[1] !== null && entry[1] !== undefined)
 	.map(([name, value]) => h('div', {}, h('dt', {}, name), h('dd', {}, value))))
@@ -48,7 +48,7 @@ function parameterFacts(job) {
 		if (!group.pointer)
 			return group.fields.map(field => [t(field.label).split(', ')[0], valueText(job, field, plain, t)])
 		if (at(job, group.pointer))
-			return [[t(group.title), stageText(job, group, plain, t)]]
+			return [[t(group.title), stageText(job, group, plain, t, inSentence)]]
 		return group.algorithm && iterates ? [] : [[t(group.title), t('none')]]
 	})
 }

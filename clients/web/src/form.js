@@ -121,7 +121,7 @@ export class JobForm {
 		let input
 		if (field.kind === 'choice')
 			input = h('select', {}, [...(field.values.includes(value) || value === undefined || value === null ? [] : [value]), ...field.values]
-				.map(name => h('option', { value: name, selected: name === value }, name)))
+				.map(name => h('option', { value: name, selected: name === value }, t(name))))
 		else if (field.kind === 'flag')
 			input = h('input', { type: 'checkbox', checked: value ?? field.unset ?? true })
 		else

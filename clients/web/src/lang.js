@@ -1,12 +1,14 @@
 /*
- * The page's words. The sources have them in English; another language is a file lang/CODE.js with its name and a table
- * from the English ones. What it lacks stays English. {name} in a text stands for a value.
+ * The page's words. The sources have them in English; another language is a file lang/CODE.js with a table from the
+ * English ones, and `capitals` where nouns keep theirs within a sentence. What it lacks stays English. {name} in a text
+ * stands for a value.
  */
 const kept = 'cbctd-language' /* in localStorage, where somebody has chosen one */
 
 export const languages = ['en', ...LANGUAGES]
 let code = 'en'
 let strings = {}
+let capitals = false /* of nouns, anywhere in a sentence */
 
 export const language = () => code
 
@@ -14,6 +16,9 @@ export function t(text, values) {
 	const found = strings[text] ?? text
 	return values === undefined ? found : found.replace(/\{(\w+)\}/g, (whole, name) => values[name] ?? whole)
 }
+
+/* Words of a label within a sentence. */
+export const inSentence = text => capitals ? text : text.toLowerCase()
 
 /* One or more: t2(n, '{n} job', '{n} jobs'). */
 export const t2 = (n, one, more, values) => t(n === 1 ? one : more, { n, ...values })
@@ -37,7 +42,7 @@ export async function loadLanguage() {
 	code = chosen()
 	document.documentElement.lang = code
 	if (code !== 'en')
-		strings = (await import(`./lang/${code}.js`)).strings
+		({ strings, capitals = false } = await import(`./lang/${code}.js`))
 }
 
 export function chooseLanguage(name) {

@@ -4,7 +4,7 @@ import { get, id, watch, volumePath } from './api.js'
 import { Bar, badge, doing, left, ended, recipeText } from './state.js'
 import { reconstructAgain } from './form.js'
 import { groups, valueText } from './parameters.js'
-import { t, t2 } from './lang.js'
+import { t, t2, inSentence } from './lang.js'
 
 const pollTime = 2000 /* ms, while a job runs */
 const typingTime = 250 /* ms between letters and asking */
@@ -79,7 +79,7 @@ async function differences(jobs, wanted) {
 	const tell = alike => {
 		const texts = fields.map(field => alike.map(job => text(job, field)))
 		const apart = fields.map((field, i) => [field, texts[i]]).filter(([, values]) => new Set(values.filter(value => value !== null)).size > 1)
-		alike.forEach((job, i) => found.set(job.id, apart.filter(([, values]) => values[i] !== null).slice(0, differencesMost).map(([field, values]) => `${t(field.label).split(', ')[0].toLowerCase()} ${values[i]}`).join(', ')))
+		alike.forEach((job, i) => found.set(job.id, apart.filter(([, values]) => values[i] !== null).slice(0, differencesMost).map(([field, values]) => `${inSentence(t(field.label).split(', ')[0])} ${values[i]}`).join(', ')))
 	}
 	/* A job alone differs from none. */
 	return await inPieces([...scans.values()].filter(alike => alike.length > 1), tell, wanted) ? found : null
@@ -186,7 +186,7 @@ export class ListPage {
 
 	/* Rows are made in pieces, so that a long list holds nothing up; a later call ends this one. */
 	async #show(text) {
-		const number = ++this.#showing, wanted = () => number === this.#showing && !this.#closed
+		const turn = ++this.#showing, wanted = () => turn === this.#showing && !this.#closed
 		const known = new Set([...this.#open, ...this.#jobs].map(job => job.id))
 		const all = [...this.#open, ...this.#jobs, ...this.#older.filter(job => !known.has(job.id))], rows = new Map()
 		const apart = await differences(all, wanted)

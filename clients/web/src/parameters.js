@@ -16,7 +16,7 @@ const text = (pointer, label, options) => ({ pointer, label, kind: 'text', ...op
 
 /*
  * label: with the unit behind a comma. kind: how it is asked for. hint, empty, wide, write, read: of the form. word:
- * that may stand in place of the number. zero: what 0 means. unset: what a flag is where the job has none, else true.
+ * that may stand in place of the number. zero, one: what 0 and 1 mean. unset: what a flag is where the job has none, else true.
  * A group with a pointer is a stage: the form leaves it out by its checkbox. What is empty is left to the daemon's
  * defaults.
  */
@@ -55,7 +55,7 @@ export const groups = [
 		text('/emit', 'Keep volumes', { hint: 'fdk, fdk-tv, iterations', empty: 'the last one only', wide: true, read: value => value.split(/[\s,]+/).filter(Boolean).map(name => /^\d+$/.test(name) ? Number(name) : name),
 			write: list => (list ?? []).join(', ') }),
 		choice('/priority', 'Priority', ['routine', 'urgent', 'stat']), text('/devices', 'Devices', { hint: 'or all', word: 'all', read: numberOrText }), choice('/precision', 'Precision', ['standard', 'reference']),
-		choice('/projector', 'Projector', ['interpolating', 'matched']), text('/binning', 'Binning, pixels', { hint: 'or auto', word: 'auto', read: numberOrText }), flag('/rings', 'Mend pixels that make rings'), flag('/hold_out', 'Hold one projection of twenty out'), number('/mu_water', 'Water, 1/mm'),
+		choice('/projector', 'Projector', ['interpolating', 'matched']), text('/binning', 'Binning, pixels', { one: 'none', hint: 'or auto', word: 'auto', read: numberOrText }), flag('/rings', 'Mend pixels that make rings'), flag('/hold_out', 'Hold one projection of twenty out'), number('/mu_water', 'Water, 1/mm'),
 	] },
 ]
 /* Stages for a purpose, and what each is for. */
@@ -71,19 +71,19 @@ export const members = [...new Set([...groups.flatMap(({ pointer, fields }) => p
 /* ---- as words ---- */
 
 /* The value of a field in a job, with its unit; null where the job has none. */
-export function valueText(job, { pointer, label, zero, write, empty }, format, t = text => text) {
-	const value = at(job, pointer), unit = label.split(', ')[1]
+export function valueText(job, { pointer, label, zero, one, write, empty }, format, t = text => text) {
+	const value = at(job, pointer), unit = t(label).split(', ')[1]
 	if (value === undefined || value === null)
 		return null
 	if (write)
 		return write(value) || t(empty)
 	if (typeof value === 'boolean')
 		return t(value ? 'yes' : 'no')
-	return typeof value !== 'number' ? String(value) : value === 0 && zero ? t(zero) : `${format(value)}${unit ? ` ${unit}` : ''}`
+	return typeof value !== 'number' ? t(String(value)) : value === 0 && zero ? t(zero) : value === 1 && one ? t(one) : `${format(value)}${unit ? ` ${unit}` : ''}`
 }
 
 /* All fields of a stage that the job has: "window hann, cutoff 1 of Nyquist". */
-export function stageText(job, group, format, t = text => text) {
-	const name = ({ label }) => t(label).split(', ')[0].toLowerCase()
+export function stageText(job, group, format, t = text => text, inSentence = text => text.toLowerCase()) {
+	const name = ({ label }) => inSentence(t(label).split(', ')[0])
 	return group.fields.map(field => [name(field), valueText(job, field, format, t)]).filter(([, text]) => text !== null).map(parts => parts.join(' ')).join(', ')
 }

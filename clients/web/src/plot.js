@@ -4,7 +4,7 @@
  * of magnitude. The same numbers stand in a table for those who do not see it.
  */
 import { h, svg, replace, number, superscript, duration } from './dom.js'
-import { t } from './lang.js'
+import { t, inSentence } from './lang.js'
 
 const series = [
 	{ key: 'residual', name: 'Residual', hint: '‖p − A v‖ / ‖p‖' },
@@ -105,7 +105,7 @@ export class Plot {
 		const height = series.length * panel + foot
 		this.picture.setAttribute('viewBox', `0 0 ${width} ${height}`)
 		this.picture.setAttribute('aria-label', t('Convergence over {n} iterations: ', { n: this.#rows.length }) +
-			series.map(one => `${t(one.name).toLowerCase()} ${number(last[one.key])}`).join(', '))
+			series.map(one => `${inSentence(t(one.name))} ${number(last[one.key])}`).join(', '))
 		this.cursor = svg('line', { class: 'cursor', y1: top - 6, y2: series.length * panel })
 		replace(this.picture, this.cursor, series.map((one, i) => this.#panel(one, i * panel)), this.#iterations(series.length * panel))
 		this.#setCursor(this.#selected)

@@ -76,10 +76,11 @@ export class Bar {
 	}
 
 	show(job) {
-		const percent = Math.round(job.progress * 100)
+		/* What a job waits for is what it shows: the share of the projections. */
+		const share = job.state === 'waiting' && job.views ? job.views.received / job.views.of : job.progress, percent = Math.round(share * 100)
 		this.element.dataset.state = job.state
 		this.element.setAttribute('aria-valuenow', String(percent))
 		this.element.setAttribute('aria-valuetext', [`${percent} %`, doing(job), left(job)].filter(Boolean).join(', '))
-		this.fill.style.width = `${job.progress * 100}%`
+		this.fill.style.width = `${share * 100}%`
 	}
 }

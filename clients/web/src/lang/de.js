@@ -1,4 +1,5 @@
 /* German: lang.js. */
+export const capitals = true
 export const strings = {
 	' and ': ' und ',
 	' · metal corrected': ' · Metall korrigiert',
@@ -276,6 +277,16 @@ export const strings = {
 	'more are refused until one is removed': 'weitere werden abgelehnt, bis einer entfernt ist',
 	'more is refused until something is removed': 'mehr wird abgelehnt, bis etwas entfernt ist',
 	'never': 'nie',
+	'routine': 'Routine',
+	'stat': 'sofort',
+	'standard': 'Standard',
+	'reference': 'Referenz',
+	'interpolating': 'interpolierend',
+	'matched': 'angepasst',
+	'light': 'leicht',
+	'medium': 'mittel',
+	'strong': 'stark',
+	'off': 'aus',
 	'next in the queue': 'als Nächstes an der Reihe',
 	'no': 'nein',
 	'no note': 'kein Vermerk',
@@ -414,7 +425,7 @@ export const strings = {
 	'as the scan says': 'wie der Scan sie angibt',
 	'Refine from the projections': 'Aus den Projektionen verfeinern',
 	'Follow the patient’s motion': 'Der Bewegung des Patienten folgen',
-	'Mend pixels that make rings': 'Pixel ausgleichen, die Ringe machen',
+	'Mend pixels that make rings': 'Ringe durch Pixel ausgleichen',
 	'Hold one projection of twenty out': 'Jede zwanzigste Projektion zurückhalten',
 	'Weights of rays': 'Gewichte der Strahlen',
 	'Water, 1/mm': 'Wasser, 1/mm',
