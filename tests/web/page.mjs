@@ -604,6 +604,28 @@ test('rulers and angles are true at any zoom and in turned planes; a region has 
 	await forget()
 })
 
+test('a freehand region of any shape has its voxels\' mean, and its area', async () => {
+	await forget()
+	const page = await openFinished(), spacing = [3, 3.4, 2.8], size = [36, 32, 40], width = size[0] * spacing[0], height = size[1] * spacing[1]
+	/* An L, whose sides lie between the voxels' middles. */
+	const isIn = (x, y) => x > -39 && x < 12 && y > -30.6 && y < -6.8 || x > -39 && x < -9 && y > -30.6 && y < 20.4
+	await tool(page, 'freehand')
+	const corners = await Promise.all([[-39, -30.6], [12, -30.6], [12, -6.8], [-9, -6.8], [-9, 20.4], [-39, 20.4]].map(([x, y]) => spot(page, 'z', 0.5 + x / width, 0.5 + y / height)))
+	await page.mouse.move(...corners[0])
+	await page.mouse.down()
+	for (const corner of corners.slice(1))
+		await page.mouse.move(...corner, { steps: 4 })
+	await page.mouse.up()
+	const [region] = await until('measured', () => measured(page), list => list.length === 1)
+	const voxels = new Int16Array(await (await fetch(`${origin}/v1/jobs/${finished}/volumes/final?format=raw&type=int16`)).arrayBuffer()), z = await depthOf(page, 'z')
+	const inside = Array.from({ length: size[0] * size[1] }, (_, i) => i).filter(i => isIn((i % size[0] - 17.5) * spacing[0], (Math.floor(i / size[0]) - 15.5) * spacing[1]))
+	const mean = inside.reduce((sum, i) => sum + voxels[z * size[0] * size[1] + i], 0) / inside.length, area = 51 * 23.8 + 30 * 27.2
+	expect(Math.abs(parseFloat(region.replace('−', '-')) - mean) < 0.5, `a mean of ${mean} HU, got ${region}`)
+	expect(Math.abs(parseFloat(region.split('HU, ')[1]) - area) < 0.03 * area, `an area of ${area} mm2, got ${region}`)
+	await page.context().close()
+	await forget()
+})
+
 test('slabs are the daemon\'s at any angle, pixel by pixel', async () => {
 	const [{ samplerOf }, { cross, unit, times }] = await Promise.all(['sample.js', 'vector.js'].map(file => import(pathToFileURL(`${sources}/${file}`))))
 	const { volumes } = await api(`/v1/jobs/${finished}/volumes`), { size, spacing_mm: spacing, origin_mm: corner } = volumes.find(({ name }) => name === 'final')
