@@ -194,7 +194,7 @@ $(BUILD)/cbctd-without-postgresql: $(filter-out $(BUILD)/daemon/store/postgresql
 
 gpu_programs := $(BUILD)/gpu_check $(BUILD)/gpu_bench $(BUILD)/gpu_cards
 # Every program that a test or a benchmark runs, so that none stops compiling unseen.
-test-programs: $(addprefix $(BUILD)/,unit cbct-worker-held cbctd-held cbctd-without-postgresql manual faults.so clock.so every.so live_bytes.so simulated-nvml/libnvidia-ml.so.1 cpu-bench calibrate-bench agreement refine denoise presets stopping methods watchers slices acquire paper-project rabbitct) \
+test-programs: $(addprefix $(BUILD)/,unit cbct-worker-held cbctd-held cbctd-without-postgresql manual faults.so clock.so every.so live_bytes.so simulated-nvml/libnvidia-ml.so.1 cpu-bench calibrate-bench agreement refine denoise presets stopping methods watchers slices acquire paper-project rabbitct $(if $(postgresql),claims)) \
                $(if $(cuda_objects),$(gpu_programs) $(BUILD)/gpu_ceilings $(BUILD)/cbct-worker-faulty,$(call objects,$(wildcard tests/bench/gpu_*.c)))
 
 # Faults of the disk, loaded into the programs by tests.
@@ -250,6 +250,10 @@ $(BUILD)/refine: $(call objects,tests/bench/refine.c tests/bench/bodies.c tests/
 
 $(BUILD)/calibrate-bench: $(call objects,tests/bench/calibrate.c tests/unit/arm.c) $(library)
 	$(call say,LINK)$(CC) $(LDFLAGS) -o $@ $^ $(call pkg,--libs,$(core_libs)) $(LIBM)
+
+# Claims of many workers at once in the ledger of a fleet.
+$(BUILD)/claims: $(call objects,tests/bench/claims.c $(state_sources)) $(library)
+	$(call say,LINK)$(CC) $(LDFLAGS) -o $@ $^ $(call pkg,--libs,sqlite3 $(files_libs) $(proto_libs) $(core_libs)) $(LIBM)
 
 $(BUILD)/watchers $(BUILD)/slices $(BUILD)/acquire: $(BUILD)/%: $(BUILD)/tests/bench/%.o
 	$(call say,LINK)$(CC) $(LDFLAGS) -o $@ $^ -lpthread

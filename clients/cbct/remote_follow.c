@@ -210,20 +210,20 @@ static int keep_checkpoint(struct remote *remote, struct error *err)
 }
 
 /*
- * A job that has been sent all that it needs, still waits, and takes none of it in: something was lost there. One whose
- * worker is slower than the way waits until it has come to the last.
+ * A job that has been sent all that it needs, and still waits for something, or for somebody to take it in: something
+ * was lost there. One whose worker is slower than the way waits for nothing until it has come to the last.
  */
 static int heed_waiting(struct remote *remote, const cJSON *job, bool waits, struct error *err)
 {
-	const int taken = (int)member_number(cJSON_GetObjectItemCaseSensitive(job, "views"), "reconstructed", 0);
+	const bool attended = member_text(job, "stage", NULL) != NULL &&
+			      cJSON_GetArraySize(cJSON_GetObjectItemCaseSensitive(job, "waiting_for")) == 0;
 
-	if (!waits || remote->sent < remote->files.scan->count) {
+	if (!waits || attended || remote->sent < remote->files.scan->count) {
 		remote->waits = 0;
 		return 0;
 	}
-	if (remote->waits == 0 || taken != remote->taken)
+	if (remote->waits == 0)
 		remote->waits = clock_monotonic();
-	remote->taken = taken;
 	return clock_monotonic() < remote->waits + remote->options->lease
 		   ? 0
 		   : error_set(err, ERR_BUSY, "on %.60s something of it was lost", remote->options->host);

@@ -36,7 +36,6 @@ struct remote {
 	int iteration; /* of the last row */
 	struct remote_checkpoint checkpoint;
 	double waits; /* monotonic: since when the job there waits though it has all that it needs; 0: it does not */
-	int taken;    /* projections reconstructed there, as seen last while it waits */
 	bool opened, denoised, agreed, stopped;
 	char fetched[REMOTE_VOLUMES_MOST][32];
 };

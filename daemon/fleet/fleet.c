@@ -107,9 +107,20 @@ static void leave(struct fleet *fleet)
 	fleet->ledger = NULL;
 }
 
+/* Another one for each host, from 0 to 1: not all of them ask the ledger in the same moment when one offers a job. */
+static double place_of(const struct fleet *fleet)
+{
+	unsigned hash = 2166136261u; /* FNV-1a */
+
+	for (const char *at = fleet->host; *at != '\0'; at++)
+		hash = (hash ^ (unsigned char)*at) * 16777619u;
+	return (double)hash / 4294967295.0;
+}
+
 static void *fleet_loop(void *context)
 {
 	struct fleet *fleet = context;
+	const double apart = LEAST * place_of(fleet);
 	struct error err;
 
 	while (!atomic_load(&fleet->stop)) {
@@ -127,6 +138,7 @@ static void *fleet_loop(void *context)
 		} else if (ledger_wait(fleet->ledger, fleet->wake, LOOK, &err) != 0) {
 			lose(fleet, &err);
 		}
+		pause_for(apart);
 		empty(fleet->wake);
 	}
 	leave(fleet);

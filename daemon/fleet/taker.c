@@ -21,6 +21,20 @@ static int least_priority(const struct load *load, int devices, bool *ret_pushes
 	return least;
 }
 
+/* A claim whose job is not here: it is still to come, or it has ended, and another may have its device. */
+static bool lacks_job(struct fleet *fleet)
+{
+	struct load load;
+	bool lacks = false;
+
+	if (fleet->claim_count == 0)
+		return false;
+	fleet_weigh(fleet, false, &load);
+	for (int i = 0; i < fleet->claim_count; i++)
+		lacks |= !load.begun[i];
+	return lacks;
+}
+
 int fleet_take(struct fleet *fleet, struct error *err)
 {
 	const int devices = fleet_devices(fleet, false);
@@ -28,7 +42,8 @@ int fleet_take(struct fleet *fleet, struct error *err)
 	char rates[LEDGER_RATES_SIZE];
 	const int memory_count = fleet_memory(fleet, memory);
 	const bool due =
-	    clock_monotonic() >= fleet->renewed + (fleet->options.lease / 6 < LOOK ? fleet->options.lease / 6 : LOOK);
+	    clock_monotonic() >= fleet->renewed + (fleet->options.lease / 6 < LOOK ? fleet->options.lease / 6 : LOOK) ||
+	    lacks_job(fleet);
 	bool got = true, pushes;
 	struct load load;
 	int code = 0, least;

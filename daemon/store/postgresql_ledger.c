@@ -142,6 +142,7 @@ int ledger_open(const struct ledger_options *options, struct ledger **ret_ledger
 	snprintf(ledger->url, sizeof(ledger->url), "%s", options->url);
 	ledger->lease = options->lease;
 	ledger->session.timeout = options->timeout;
+	snprintf(ledger->session.listener, sizeof(ledger->session.listener), "%s", options->host);
 	snprintf(name, sizeof(name), "cbctd host %s", ledger->host);
 	code = session_open(&ledger->session, options->database, name, ledger->schema, err);
 	if (code == 0)
@@ -233,12 +234,30 @@ static int note_claim(void *context, const struct value *values, struct error *e
 	return 0;
 }
 
-static int tell_others(struct ledger *ledger, struct error *err)
+/* who: the one host that this is news for; "": all of them. */
+static int tell(struct ledger *ledger, const char *who, struct error *err)
 {
-	char sql[PG_SCHEMA_SIZE + 16];
+	char sql[PG_SCHEMA_SIZE + LEDGER_NAME_SIZE + 16];
 
-	snprintf(sql, sizeof(sql), "NOTIFY %s", ledger->schema);
+	snprintf(sql, sizeof(sql), "NOTIFY %s, '%s'", ledger->schema, who);
 	return session_execute(&ledger->session, sql, NULL, err);
+}
+
+/* For whom an offer's change is news. */
+struct news {
+	char who[LEDGER_NAME_SIZE]; /* with one: that host */
+	int count;                  /* hosts; more than one: all */
+};
+
+static int note_news(void *context, const struct value *values, struct error *err)
+{
+	struct news *news = context;
+	const char *who = values[0].bytes;
+
+	(void)err;
+	news->count += who[0] == '\0' ? 2 : news->count == 0 || strcmp(news->who, who) != 0;
+	snprintf(news->who, sizeof(news->who), "%s", who);
+	return 0;
 }
 
 static int note_change(void *context, const struct value *values, struct error *err)
@@ -369,7 +388,7 @@ int ledger_offer(struct ledger *ledger, const struct offer *offers, int count, s
 {
 	struct value values[] = {text_value(ledger->host), text_value("")};
 	char *text = print_offers(offers, count);
-	bool changed = false;
+	struct news news = {.count = 0};
 	int code;
 
 	if (text == NULL)
@@ -380,15 +399,17 @@ int ledger_offer(struct ledger *ledger, const struct offer *offers, int count, s
 			"WITH mine AS (SELECT * FROM json_to_recordset($2::json)"
 			" AS row (job text, priority bigint, rank bigint, host text, memory float8, devices bigint)),"
 			" gone AS (DELETE FROM offers WHERE owner = $1::text AND job NOT IN (SELECT job FROM mine)"
-			" RETURNING job),"
+			" RETURNING taker),"
 			" there AS (INSERT INTO offers (owner, job, priority, rank, host, memory, devices)"
 			" SELECT $1::text, job, priority, rank, host, memory, devices FROM mine"
 			" ON CONFLICT (owner, job) DO UPDATE SET priority = excluded.priority, rank = excluded.rank"
 			" WHERE (offers.priority, offers.rank) IS DISTINCT FROM (excluded.priority, excluded.rank)"
-			" RETURNING job) SELECT job FROM there UNION ALL SELECT job FROM gone LIMIT 1",
-			values, 2, note_change, &changed, err);
+			/* A row that was updated has been locked by this statement: it was no new one. */
+			" RETURNING xmax) SELECT ''::text FROM there WHERE xmax = 0"
+			" UNION SELECT taker FROM gone WHERE taker IS NOT NULL",
+			values, 2, note_news, &news, err);
 	free(text);
-	return code == 0 && changed ? tell_others(ledger, err) : code;
+	return code == 0 && news.count > 0 ? tell(ledger, news.count == 1 ? news.who : "", err) : code;
 }
 
 int ledger_claimed(struct ledger *ledger, struct fleet_claim *ret_claims, int most, int *ret_count, struct error *err)
@@ -432,7 +453,7 @@ int ledger_claim(struct ledger *ledger, int least, double age, const double *mem
 	    values, 5, note_claim, &claims, err);
 
 	*ret_got = claims.count > 0;
-	return code == 0 && *ret_got ? tell_others(ledger, err) : code;
+	return code == 0 && *ret_got ? tell(ledger, ret_claim->owner, err) : code;
 }
 
 int ledger_renew(struct ledger *ledger, struct fleet_claim *ret_claims, int most, int *ret_count, struct error *err)
@@ -464,7 +485,7 @@ int ledger_give_back(struct ledger *ledger, const struct fleet_claim *claim, dou
 			   " until = now() + $4::float8 * interval '1 second' WHERE owner = $1::text"
 			   " AND job = $2::text AND number = $3::bigint RETURNING job",
 			   values, 4, note_change, ret_had, err);
-	return code == 0 && *ret_had ? tell_others(ledger, err) : code;
+	return code == 0 && *ret_had ? tell(ledger, "", err) : code;
 }
 
 int ledger_wait(struct ledger *ledger, int descriptor, double seconds, struct error *err)

@@ -444,28 +444,31 @@ static bool take_notifications(struct pg_session *session)
 	bool some = false;
 
 	while ((notification = pq.PQnotifies(session->pg)) != NULL) {
+		some |= notification->extra[0] == '\0' || strcmp(notification->extra, session->listener) == 0;
 		pq.PQfreemem(notification);
-		some = true;
 	}
 	return some;
 }
 
 int session_wait(struct pg_session *session, int descriptor, double seconds, struct error *err)
 {
-	struct pollfd fds[2];
-	int ready;
+	const double end = clock_monotonic() + seconds;
+	bool done;
 
 	if (session->pg == NULL)
 		return session_away(err, "the connection was lost");
 	/* Those that came with the answer to another question. */
-	if (take_notifications(session))
-		return 0;
-	fds[0] = (struct pollfd){.fd = pq.PQsocket(session->pg), .events = POLLIN};
-	fds[1] = (struct pollfd){.fd = descriptor, .events = POLLIN};
-	ready = poll(fds, 2, seconds <= 0 ? 0 : (int)(1000 * seconds) + 1);
-	if (ready > 0 && fds[0].revents != 0 && pq.PQconsumeInput(session->pg) == 0)
-		return lose(session, pq.PQerrorMessage(session->pg), err);
-	take_notifications(session);
+	done = take_notifications(session);
+	while (!done) {
+		struct pollfd fds[2] = {{.fd = pq.PQsocket(session->pg), .events = POLLIN},
+					{.fd = descriptor, .events = POLLIN}};
+		const double left = end - clock_monotonic();
+		int ready = poll(fds, 2, left <= 0 ? 0 : (int)(1000 * left) + 1);
+
+		if (ready > 0 && fds[0].revents != 0 && pq.PQconsumeInput(session->pg) == 0)
+			return lose(session, pq.PQerrorMessage(session->pg), err);
+		done = take_notifications(session) || ready <= 0 || fds[1].revents != 0;
+	}
 	return 0;
 }
 

@@ -16,9 +16,10 @@
 enum { PG_STATEMENTS_MAX = 96, PG_VALUES_MAX = 64, PG_SCHEMA_SIZE = 64 };
 
 struct pg_session {
-	PGconn *pg;     /* NULL: lost */
-	int process;    /* of the server, that serves it; of the one before while it is lost */
-	double timeout; /* s */
+	PGconn *pg;        /* NULL: lost */
+	int process;       /* of the server, that serves it; of the one before while it is lost */
+	double timeout;    /* s */
+	char listener[64]; /* of session_wait */
 	const char *prepared[PG_STATEMENTS_MAX];
 	int prepared_count;
 };
@@ -47,8 +48,8 @@ int session_run(struct pg_session *session, const char *sql, const struct value 
 		void *context, struct error *err);
 
 /*
- * Sleeps until a notification has come (LISTEN), `descriptor` can be read, or so many seconds have passed. Whichever it
- * was, and what the notifications say, is not told.
+ * Sleeps until a notification has come (LISTEN) that says nothing or the name `listener`, `descriptor` can be read, or
+ * so many seconds have passed. Whichever it was is not told.
  */
 int session_wait(struct pg_session *session, int descriptor, double seconds, struct error *err);
 
