@@ -4,6 +4,7 @@
 #include <stdlib.h>
 
 struct refining {
+	enum refine_kind kind;
 	struct reduced reduced;
 	float *view; /* [row][column], on its way into bins */
 };
@@ -24,6 +25,7 @@ int refining_new(const struct recipe *recipe, const struct geometry *geometry, c
 	refining = calloc(1, sizeof(*refining));
 	if (refining == NULL)
 		return error_set(err, ERR_NO_MEMORY, "no memory to refine a geometry");
+	refining->kind = recipe->refine.motion ? REFINE_MOTION : REFINE_GEOMETRY;
 	code = reduced_open(&refining->reduced, geometry, orbit, REFINE_VIEWS_MOST, REFINE_BINS_MOST, err);
 	refining->view = malloc((size_t)geometry->columns * (size_t)geometry->rows * sizeof(float));
 	if (code == 0 && refining->view == NULL)
@@ -81,17 +83,16 @@ int refining_find(struct refining *refining, const struct recipe *recipe, const 
 {
 	for (int i = 0; i < blanks; i++)
 		reduced_leave_out(&refining->reduced, blank[i]);
-	return refine_find(&refining->reduced, orbit, recipe->refine.motion ? REFINE_MOTION : REFINE_GEOMETRY,
-			   recipe->mu_water, watch, ret_refinement, err);
+	return refine_find(&refining->reduced, orbit, refining->kind, recipe->mu_water, watch, ret_refinement, err);
 }
 
 int refining_work(const struct refining *refining, const struct grid *grid, int views, double *ret_work,
 		  struct error *err)
 {
-	double fdks = 0, updates = 0;
-	int code = refining == NULL ? 0 : refine_work(&refining->reduced, &fdks, &updates, err);
+	double updates = 0;
+	int code = refining == NULL ? 0 : refine_work(&refining->reduced, refining->kind, &updates, err);
 
 	if (code == 0)
-		*ret_work = fdks * updates / ((double)grid_voxels(grid) * views);
+		*ret_work = updates / ((double)grid_voxels(grid) * views);
 	return code;
 }

@@ -59,6 +59,21 @@ void path_double(struct path *path)
 	*path = fine;
 }
 
+double path_size(const struct path *path)
+{
+	enum { PLACES = 256 };
+	double squares = 0;
+
+	for (int i = 0; i < PLACES; i++) {
+		double numbers[PATH_NUMBERS];
+
+		path_at(path, path->length * i / (PLACES - 1), numbers);
+		for (int a = 0; a < PATH_NUMBERS; a++)
+			squares += path->of_views && a == 2 ? 0 : numbers[a] * numbers[a] / PLACES;
+	}
+	return sqrt(squares);
+}
+
 void view_axes(const struct view *view, double ret_axes[3][3])
 {
 	memcpy(ret_axes[0], view->column_step, sizeof(ret_axes[0]));
@@ -92,6 +107,8 @@ void path_motion(const struct path *path, double at, const struct view *view, do
 	path_at(path, at, numbers);
 	view_axes(view, axes);
 	to_world(path, axes, numbers, ret_motion);
+	for (int i = 0; i < PATH_NUMBERS; i++)
+		ret_motion[i] += path->common[i];
 	for (int i = 3; i < PATH_NUMBERS; i++)
 		ret_motion[i] *= PATH_TURN_UNIT;
 }
@@ -132,12 +149,16 @@ struct equations {
 	double *matrix, *right; /* [size][size], [size] */
 };
 
-/* M' products M, where M takes numbers of the path to those of the world; [0] is the residual's. */
-static void turn_products(const struct path *path, double axes[3][3], const double *products,
-			  double ret[PATH_NUMBERS + 1][PATH_NUMBERS + 1])
+/* Standard deviations, mm and hundredths of a radian: what all views share may be large. */
+static const double COMMON_EXPECTED = 10;
+/* The residual, the path's numbers, and those that all views share. */
+enum { ALL = 1 + 2 * PATH_NUMBERS, COMMON = 1 + PATH_NUMBERS };
+
+/* M' products M, where M takes numbers of the path, and common ones, to those of the world; [0] is the residual's. */
+static void turn_products(const struct path *path, double axes[3][3], const double *products, double ret[ALL][ALL])
 {
-	enum { ALL = PATH_NUMBERS + 1 };
-	double m[ALL][ALL] = {{0}}, full[ALL][ALL], half[ALL][ALL] = {{0}};
+	enum { WORLD = 1 + PATH_NUMBERS };
+	double m[WORLD][ALL] = {{0}}, full[WORLD][WORLD], half[WORLD][ALL] = {{0}};
 
 	m[0][0] = 1;
 	for (int i = 0; i < PATH_NUMBERS; i++) {
@@ -147,25 +168,26 @@ static void turn_products(const struct path *path, double axes[3][3], const doub
 		to_world(path, axes, one, world);
 		for (int a = 0; a < PATH_NUMBERS; a++)
 			m[a + 1][i + 1] = world[a];
+		m[i + 1][COMMON + i] = 1;
 	}
-	for (int i = 0, at = 0; i < ALL; i++)
+	for (int i = 0, at = 0; i < WORLD; i++)
 		for (int j = 0; j <= i; j++)
 			full[i][j] = full[j][i] = products[at++];
-	for (int i = 0; i < ALL; i++)
+	for (int i = 0; i < WORLD; i++)
 		for (int j = 0; j < ALL; j++)
-			for (int k = 0; k < ALL; k++)
+			for (int k = 0; k < WORLD; k++)
 				half[i][j] += full[i][k] * m[k][j];
 	for (int i = 0; i < ALL; i++)
 		for (int j = 0; j < ALL; j++) {
 			ret[i][j] = 0;
-			for (int k = 0; k < ALL; k++)
+			for (int k = 0; k < WORLD; k++)
 				ret[i][j] += m[k][i] * half[k][j];
 		}
 }
 
 /* Adds that the numbers about the view's axes are expected to be small; `now` are the path's numbers. */
 static void expect_small(const struct path *path, double axes[3][3], const double sigma[PATH_NUMBERS],
-			 const double now[PATH_NUMBERS], double products[PATH_NUMBERS + 1][PATH_NUMBERS + 1])
+			 const double now[PATH_NUMBERS], double products[ALL][ALL])
 {
 	for (int i = 0; i < PATH_NUMBERS; i++)
 		for (int j = 0; j < PATH_NUMBERS; j++) {
@@ -185,32 +207,50 @@ static void expect_small(const struct path *path, double axes[3][3], const doubl
 		}
 }
 
+/* Unknowns that a view's motion is made of: six at `row`, of which the view has a share, and their first product. */
+struct part {
+	int row, product;
+	double share;
+};
+
+/* At most four knots' and the common one. */
+enum { PARTS_MOST = 5 };
+
+static int parts_of(const struct path *path, double at, struct part ret[PARTS_MOST])
+{
+	const double u = on_knots(path, at);
+	int count = 0;
+
+	for (int k = 0; k < path->knots; k++)
+		if (spline(u - k) > 0)
+			ret[count++] = (struct part){PATH_NUMBERS * k, 1, spline(u - k)};
+	if (path->of_views)
+		ret[count++] = (struct part){PATH_NUMBERS * path->knots, COMMON, 1};
+	return count;
+}
+
 static void add_view(const struct path *path, const struct path_view *view, const double sigma[PATH_NUMBERS],
 		     struct equations *equations)
 {
-	const double u = on_knots(path, view->at);
-	double axes[3][3], now[PATH_NUMBERS], products[PATH_NUMBERS + 1][PATH_NUMBERS + 1];
+	double axes[3][3], now[PATH_NUMBERS], products[ALL][ALL];
+	struct part parts[PARTS_MOST];
+	const int count = parts_of(path, view->at, parts);
 
 	path_at(path, view->at, now);
 	view_axes(&view->view, axes);
 	turn_products(path, axes, view->products, products);
 	expect_small(path, axes, sigma, now, products);
-	for (int k = 0; k < path->knots; k++) {
-		const double mine = spline(u - k);
+	for (int a = 0; a < count; a++)
+		for (int i = 0; i < PATH_NUMBERS; i++) {
+			const struct part *mine = &parts[a];
+			double *row = equations->matrix + (mine->row + i) * equations->size;
 
-		for (int i = 0; i < PATH_NUMBERS && mine > 0; i++) {
-			const int row = PATH_NUMBERS * k + i;
-
-			equations->right[row] += mine * products[i + 1][0];
-			for (int l = 0; l < path->knots; l++) {
-				const double other = spline(u - l);
-
-				for (int j = 0; j < PATH_NUMBERS && other > 0; j++)
-					equations->matrix[row * equations->size + PATH_NUMBERS * l + j] +=
-					    mine * other * products[i + 1][j + 1];
-			}
+			equations->right[mine->row + i] += mine->share * products[mine->product + i][0];
+			for (int b = 0; b < count; b++)
+				for (int j = 0; j < PATH_NUMBERS; j++)
+					row[parts[b].row + j] += mine->share * parts[b].share *
+								 products[mine->product + i][parts[b].product + j];
 		}
-	}
 }
 
 /* By Cholesky's factors; a number that no view says anything of stays as it is. The right side becomes the solution. */
@@ -260,7 +300,7 @@ static void take_mean_off(struct path *path, const struct path_view *views, int 
 int path_step(struct path *path, const struct path_view *views, int count, const double sigma[PATH_NUMBERS],
 	      double factor, struct error *err)
 {
-	struct equations equations = {.size = PATH_NUMBERS * path->knots};
+	struct equations equations = {.size = PATH_NUMBERS * (path->knots + path->of_views)};
 	const size_t size = (size_t)equations.size;
 
 	equations.matrix = calloc(size * (size + 1), sizeof(double));
@@ -270,7 +310,15 @@ int path_step(struct path *path, const struct path_view *views, int count, const
 	for (int v = 0; v < count; v++)
 		if (views[v].used)
 			add_view(path, &views[v], sigma, &equations);
+	for (int i = 0; i < PATH_NUMBERS && path->of_views; i++) {
+		const int row = PATH_NUMBERS * path->knots + i;
+
+		equations.matrix[row * equations.size + row] += 1 / (COMMON_EXPECTED * COMMON_EXPECTED);
+		equations.right[row] -= path->common[i] / (COMMON_EXPECTED * COMMON_EXPECTED);
+	}
 	solve(&equations);
+	for (int i = 0; i < PATH_NUMBERS && path->of_views; i++)
+		path->common[i] += factor * equations.right[PATH_NUMBERS * path->knots + i];
 	for (int k = 0; k < path->knots; k++)
 		for (int i = 0; i < PATH_NUMBERS; i++)
 			path->numbers[k][i] += factor * equations.right[PATH_NUMBERS * k + i];

@@ -24,10 +24,20 @@ struct path {
 	double length; /* of the sweep, radians */
 	int knots;
 	double numbers[PATH_KNOTS_MOST][PATH_NUMBERS];
+	/*
+	 * With of_views: a motion that all views share, along and about x, y and z. What the numbers are expected to be
+	 * says nothing of where the object lies, so that a step finds both.
+	 */
+	double common[PATH_NUMBERS];
 };
 
 /* A path of no motion; knots at least 4. */
 void path_open(struct path *ret_path, bool of_views, double length, int knots);
+/*
+ * Root mean square over the sweep of the six numbers, in their units, but for the way along the beam, which shows
+ * least: about the millimetres by which a path moves what is seen.
+ */
+double path_size(const struct path *path);
 /* The same path with twice as many intervals between its knots, as many as there may be. */
 void path_double(struct path *path);
 /* The six numbers at `at`, 0 .. length. */

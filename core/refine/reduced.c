@@ -96,6 +96,56 @@ int reduced_open(struct reduced *ret_reduced, const struct geometry *geometry, c
 	return code;
 }
 
+/* The mean of two by two bins of a view, [row][column] of `columns` bins. */
+static void halve_view(const float *from, int columns, const struct geometry *half, float *ret)
+{
+	for (int r = 0; r < half->rows; r++)
+		for (int c = 0; c < half->columns; c++) {
+			const float *bins = from + (size_t)(2 * r) * (size_t)columns + 2 * c;
+
+			*ret++ = (bins[0] + bins[1] + bins[columns] + bins[columns + 1]) / 4;
+		}
+}
+
+int reduced_halve(const struct reduced *reduced, struct reduced *ret_half, struct error *err)
+{
+	const struct geometry *fine = &reduced->geometry;
+	const size_t count = (size_t)fine->count, all = (size_t)reduced->all;
+	const size_t bins = (size_t)fine->columns * (size_t)fine->rows;
+	struct reduced half = *reduced;
+	size_t pixels;
+	int code;
+
+	half.geometry = (struct geometry){0};
+	half.views = malloc(count * sizeof(int));
+	half.index = malloc(all * sizeof(int));
+	half.projections = malloc(count * bins / 4 * sizeof(float));
+	half.known = malloc(count * sizeof(bool));
+	code = geometry_copy(&half.geometry, fine, err);
+	if (code == 0 && (half.views == NULL || half.index == NULL || half.projections == NULL || half.known == NULL))
+		code = error_set(err, ERR_NO_MEMORY, "no memory for %d views in bins", fine->count);
+	if (code < 0) {
+		reduced_clear(&half);
+		return code;
+	}
+	half.geometry.columns = fine->columns / 2;
+	half.geometry.rows = fine->rows / 2;
+	pixels = (size_t)half.geometry.columns * (size_t)half.geometry.rows;
+	for (int a = 0; a < 2; a++)
+		half.pixels_of_a_bin[a] *= 2;
+	memcpy(half.views, reduced->views, count * sizeof(int));
+	memcpy(half.index, reduced->index, all * sizeof(int));
+	memcpy(half.known, reduced->known, count * sizeof(bool));
+#pragma omp parallel for schedule(static)
+	for (int k = 0; k < fine->count; k++) {
+		half.geometry.views[k] = view_in_bins(&fine->views[k], 2, 2);
+		halve_view(reduced->projections + (size_t)k * bins, fine->columns, &half.geometry,
+			   half.projections + (size_t)k * pixels);
+	}
+	*ret_half = half;
+	return 0;
+}
+
 void reduced_clear(struct reduced *reduced)
 {
 	geometry_clear(&reduced->geometry);

@@ -22,6 +22,8 @@ struct reduced {
 /* At most `views` views spread evenly over the orbit, and at most `bins` bins along either side of the detector. */
 int reduced_open(struct reduced *ret_reduced, const struct geometry *geometry, const struct orbit *orbit, int views,
 		 int bins, struct error *err);
+/* The same views in bins of two by two of these. */
+int reduced_halve(const struct reduced *reduced, struct reduced *ret_half, struct error *err);
 void reduced_clear(struct reduced *reduced);
 
 /* Bytes of the host's memory that reduced_open takes. */

@@ -14,16 +14,18 @@
  * edges in does not explain the views, and what it leaves unexplained, held against the derivatives of the projections
  * by a rigid motion (projections of the volume's gradient), says how each view is to be moved (Gauss and Newton). Views
  * far off, metal and what lies outside of the grid count for less (Cauchy's weights). The motions are a smooth path
- * over the sweep, with few knots at first and then with more.
+ * over the sweep, with few knots at first and then with more; and a motion that all views share, which leaves the
+ * volume where it is while the path is found that is small about the views' own axes. First this is done in bins of
+ * twice the size, then from there on in those that are given.
  *
  * One view in eight has no part in volume and path. What the volume says of these views, moved as the path says, is
  * held against what the same iterations say of them without any motion; a path is kept only where that is better, and
- * so are more knots.
+ * where the path is larger than what such paths are where there is nothing to find.
  *
  * What all views share is no motion. Nor does a scan tell how large the object is: the way along the beam is expected
  * to be small. Bins limit what can be found, to about a thirtieth of one.
  */
-enum { REFINE_VIEWS_MOST = 120, REFINE_BINS_MOST = 80 };
+enum { REFINE_VIEWS_MOST = 120, REFINE_BINS_MOST = 160 };
 
 enum refine_kind {
 	REFINE_NONE,
@@ -36,9 +38,9 @@ struct refinement {
 	struct path path; /* no motion where it is not accepted */
 	bool accepted;
 	int held_out; /* views, */
-	double held_before,
-	    held_after; /* and the root mean square of their detail that is unexplained, without and with */
-	int better;     /* views among them that are explained better */
+	/* and the root mean square of their detail that is unexplained, without and with the path, kept or not */
+	double held_before, held_after;
+	int better; /* views among them that are explained better */
 };
 
 /* True if a scan has views, rows and columns enough. */
@@ -47,8 +49,8 @@ bool refine_is_possible(const struct geometry *geometry, const struct orbit *orb
 double refine_place(const struct orbit *orbit, int view);
 /* Bytes of the host's memory that refine_find takes: it works on the CPU's backend. */
 int refine_bytes(const struct reduced *reduced, size_t *ret_bytes, struct error *err);
-/* What it takes, in FDKs of the bins and their grid, and how many updates of a voxel by a view one of these is. */
-int refine_work(const struct reduced *reduced, double *ret_fdks, double *ret_updates, struct error *err);
+/* What it takes, in updates of a voxel by a view as FDK makes them. */
+int refine_work(const struct reduced *reduced, enum refine_kind kind, double *ret_updates, struct error *err);
 
 /* Who watches it. */
 struct refine_watch {

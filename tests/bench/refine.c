@@ -5,7 +5,7 @@
  * FDK volume's root mean square error within the body, HU. Both are taken where the geometry fits the truth best as a
  * whole: no scan tells where the object lay. `make bench-refine` builds and runs it; tests/bench/results/refine.txt has
  * its table. Arguments: pixels along a row, views, degrees, first seed, seeds, first departure, the one behind the
- * last, and the only body (0: head, 1: abdomen, 2: knee).
+ * last, the only body (0: head, 1: abdomen, 2: knee; -1: all), and the most voxels along a side of the FDK volume.
  */
 #include <math.h>
 #include <stdio.h>
@@ -23,7 +23,7 @@
 #include "tests/bench/bodies.h"
 #include "tests/unit/arm.h"
 
-enum { GRID_MOST = 160, POINTS = 18, STRIDE = 3 };
+enum { POINTS = 18, STRIDE = 3 };
 static const double HU = 1000 / BODY_WATER, WIDTH = 379.456; /* mm, of the detector */
 
 /* How the arm, or the object, departs from what the scan says. */
@@ -218,7 +218,7 @@ static int fdk_volume(const struct geometry *geometry, const float *projections,
 
 /* HU, within the body but for its metal, in every other voxel along each axis. */
 static int body_error(const struct scan *scan, const struct geometry *geometry, const double motion[PATH_NUMBERS],
-		      double *ret_hu, struct error *err)
+		      int voxels, double *ret_hu, struct error *err)
 {
 	const struct phantom phantom = {.count = scan->body.count, .parts = (struct ellipsoid *)scan->body.parts};
 	struct geometry moved = {0};
@@ -230,7 +230,7 @@ static int body_error(const struct scan *scan, const struct geometry *geometry, 
 	int code = orbit_analyse(&orbit, &scan->said, err);
 
 	if (code == 0) {
-		orbit_default_grid(&orbit, &scan->said, GRID_MOST, &grid);
+		orbit_default_grid(&orbit, &scan->said, voxels, &grid);
 		radius = .45 * orbit.field_of_view;
 		volume = malloc(grid_voxels(&grid) * sizeof(float));
 		code = geometry_copy(&moved, geometry, err);
@@ -299,44 +299,50 @@ static int refine(const struct scan *scan, enum refine_kind kind, struct geometr
 	return code;
 }
 
-static double processor_seconds(void)
+/* Of all processors together, and of the clock on the wall. */
+static void read_clocks(double ret_seconds[2])
 {
-	return (double)clock() / CLOCKS_PER_SEC;
+	struct timespec now;
+
+	clock_gettime(CLOCK_MONOTONIC, &now);
+	ret_seconds[0] = (double)clock() / CLOCKS_PER_SEC;
+	ret_seconds[1] = (double)now.tv_sec + 1e-9 * (double)now.tv_nsec;
 }
 
 static int measure(const struct departure *departure, enum kind kind, int seed, int columns, int count, double arc,
-		   struct error *err)
+		   int voxels, struct error *err)
 {
 	static const double still[PATH_NUMBERS] = {0};
 	struct scan scan;
 	struct geometry refined = {0};
 	struct refinement refinement;
-	double mm[2], hu[4], motion[2][PATH_NUMBERS], seconds = 0;
+	double mm[2], hu[4], motion[2][PATH_NUMBERS], began[2] = {0}, ended[2] = {0};
 	int code = open_scan(&scan, departure, kind, seed, columns, count, arc, err);
 
 	if (code == 0) {
-		seconds = processor_seconds();
+		read_clocks(began);
 		code = refine(&scan, departure->kind, &refined, &refinement, err);
-		seconds = processor_seconds() - seconds;
+		read_clocks(ended);
 	}
 	if (code == 0)
 		code = compare(&scan.truth, &scan.said, &mm[0], motion[0], err);
 	if (code == 0)
 		code = compare(&scan.truth, &refined, &mm[1], motion[1], err);
 	if (code == 0)
-		code = body_error(&scan, &scan.truth, still, &hu[0], err);
+		code = body_error(&scan, &scan.truth, still, voxels, &hu[0], err);
 	if (code == 0)
-		code = body_error(&scan, &scan.said, still, &hu[1], err);
+		code = body_error(&scan, &scan.said, still, voxels, &hu[1], err);
 	if (code == 0)
-		code = body_error(&scan, &scan.said, motion[0], &hu[2], err);
+		code = body_error(&scan, &scan.said, motion[0], voxels, &hu[2], err);
 	if (code == 0)
-		code = body_error(&scan, &refined, motion[1], &hu[3], err);
+		code = body_error(&scan, &refined, motion[1], voxels, &hu[3], err);
 	if (code == 0)
-		printf("%-26s %-18s %3d  %5.0f %6.1f %6.1f %6.1f %6.1f  %6.3f %6.3f  %-4s %5.1f %% %3d/%2d %5d %7.1f\n",
+		printf("%-26s %-18s %3d  %5.0f %6.1f %6.1f %6.1f %6.1f  %6.3f %6.3f  %-4s %5.2f %% %3d/%2d %5d %7.1f "
+		       "%6.1f\n",
 		       departure->name, kind_names[kind], seed, arc, hu[0], hu[1], hu[2], hu[3], mm[0], mm[1],
-		       refinement.accepted ? "yes" : "no",
-		       refinement.accepted ? 100 * (1 - refinement.held_after / refinement.held_before) : 0.,
-		       refinement.better, refinement.held_out, refinement.path.knots, seconds);
+		       refinement.accepted ? "yes" : "no", 100 * (1 - refinement.held_after / refinement.held_before),
+		       refinement.better, refinement.held_out, refinement.path.knots, ended[0] - began[0],
+		       ended[1] - began[1]);
 	fflush(stdout);
 	geometry_clear(&refined);
 	close_scan(&scan);
@@ -349,10 +355,12 @@ int main(int argc, char **argv)
 	const double arc = argc > 3 ? atof(argv[3]) : 200;
 	const int first = argc > 4 ? atoi(argv[4]) : 21, seeds = argc > 5 ? atoi(argv[5]) : 1;
 	const int from = argc > 6 ? atoi(argv[6]) : 0, to = argc > 7 ? atoi(argv[7]) : DEPARTURES;
-	const int body = argc > 8 ? atoi(argv[8]) : HEAD, bodies = argc > 8 ? body + 1 : KNEE + 1;
+	const int only = argc > 8 ? atoi(argv[8]) : -1, voxels = argc > 9 ? atoi(argv[9]) : 160;
+	const int body = only < 0 ? HEAD : only, bodies = only < 0 ? KNEE + 1 : only + 1;
 
-	printf("%-26s %-18s %3s  %5s %6s %6s %6s %6s  %6s %6s  %-4s %7s %6s %5s %7s\n", "departure", "body", "", "arc",
-	       "true", "said", "whole", "after", "mm", "after", "kept", "better", "views", "knots", "seconds");
+	printf("%-26s %-18s %3s  %5s %6s %6s %6s %6s  %6s %6s  %-4s %7s %6s %5s %7s %6s\n", "departure", "body", "",
+	       "arc", "true", "said", "whole", "after", "mm", "after", "kept", "better", "views", "knots", "seconds",
+	       "wall");
 	fflush(stdout);
 	for (int d = from; d < to && d < DEPARTURES; d++)
 		for (int kind = body; kind < bodies; kind++)
@@ -361,7 +369,8 @@ int main(int argc, char **argv)
 
 				if (departures[d].kind == REFINE_MOTION && kind != HEAD)
 					continue;
-				if (measure(&departures[d], (enum kind)kind, seed, columns, views, arc, &err) < 0) {
+				if (measure(&departures[d], (enum kind)kind, seed, columns, views, arc, voxels, &err) <
+				    0) {
 					fprintf(stderr, "%s\n", err.text);
 					return EXIT_FAILURE;
 				}

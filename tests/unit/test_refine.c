@@ -11,6 +11,7 @@
 #include <omp.h>
 #endif
 
+#include "core/fit/least_squares.h"
 #include "core/refine/refine.h"
 #include "core/scan/phantom.h"
 #include "tests/unit/arm.h"
@@ -123,6 +124,78 @@ START_TEST(a_step_finds_what_made_the_residuals)
 }
 END_TEST
 
+/* An object that stands aside in all views is a common motion, whatever is expected of the path. */
+START_TEST(what_all_views_share_is_no_path)
+{
+	static const double small[PATH_NUMBERS] = {.1, .1, .01, .01, .01, .1},
+			    aside[PATH_NUMBERS] = {1, -2, 3, .5, 1, -1};
+	const struct arm arm = {.columns = COLUMNS, .rows = ROWS, .count = VIEWS, .pixel = PIXEL, .step = .06};
+	struct path_view *views = calloc(VIEWS, sizeof(*views));
+	struct path path;
+	struct error err;
+
+	path_open(&path, true, .06 * (VIEWS - 1), 7);
+	for (int v = 0; v < VIEWS; v++) {
+		int at = 0;
+
+		views[v] = (struct path_view){.used = true, .at = .06 * v, .view = arm_nominal(&arm, v)};
+		for (int i = 0; i <= PATH_NUMBERS; i++)
+			for (int j = 0; j <= i; j++, at++)
+				views[v].products[at] = i == j ? 1e4 : j == 0 ? 1e4 * aside[i - 1] : 0;
+	}
+	ck_assert_int_eq(path_step(&path, views, VIEWS, small, 1, &err), 0);
+	for (int i = 0; i < PATH_NUMBERS; i++)
+		ck_assert_double_eq_tol(path.common[i], aside[i], .01);
+	ck_assert_double_lt(path_size(&path), .02);
+	free(views);
+}
+END_TEST
+
+/* Bins of two by two are those of a scan that is taken into bins of twice the pixels. */
+START_TEST(halved_bins_are_those_of_larger_ones)
+{
+	enum { WIDE = 64, HIGH = 64, FEW = 56 };
+	const struct arm arm = {
+	    .columns = WIDE, .rows = HIGH, .count = FEW, .pixel = 5, .first = .2, .step = 3.5 / (FEW - 1)};
+	float *projection = malloc(sizeof(float) * WIDE * HIGH);
+	struct reduced fine, half, coarse;
+	struct geometry geometry;
+	struct orbit orbit;
+	struct error err;
+
+	ck_assert_int_eq(arm_nominal_geometry(&arm, &geometry, &err), 0);
+	ck_assert_int_eq(orbit_analyse(&orbit, &geometry, &err), 0);
+	ck_assert_int_eq(reduced_open(&fine, &geometry, &orbit, FEW, 32, &err), 0);
+	ck_assert_int_eq(reduced_open(&coarse, &geometry, &orbit, FEW, 16, &err), 0);
+	for (int i = 0; i < WIDE * HIGH; i++)
+		projection[i] = (float)(i % 7) + (float)i / WIDE;
+	for (int k = 0; k < FEW; k += 3) {
+		reduced_take(&fine, k, projection);
+		reduced_take(&coarse, k, projection);
+	}
+	ck_assert_int_eq(reduced_halve(&fine, &half, &err), 0);
+	ck_assert_int_eq(half.geometry.columns, coarse.geometry.columns);
+	ck_assert_int_eq(half.geometry.rows, coarse.geometry.rows);
+	ck_assert_mem_eq(half.known, coarse.known, FEW * sizeof(bool));
+	ck_assert_mem_eq(half.views, coarse.views, FEW * sizeof(int));
+	for (int i = 0; i < FEW * half.geometry.columns * half.geometry.rows; i++)
+		ck_assert_float_eq_tol(half.projections[i], coarse.projections[i], 1e-4f);
+	for (int k = 0; k < FEW; k++)
+		for (int a = 0; a < 3; a++) {
+			ck_assert_double_eq_tol(half.geometry.views[k].pixel0[a], coarse.geometry.views[k].pixel0[a],
+						1e-9);
+			ck_assert_double_eq_tol(half.geometry.views[k].row_step[a],
+						coarse.geometry.views[k].row_step[a], 1e-9);
+		}
+	reduced_clear(&fine);
+	reduced_clear(&half);
+	reduced_clear(&coarse);
+	orbit_clear(&orbit);
+	geometry_clear(&geometry);
+	free(projection);
+}
+END_TEST
+
 /* ---- scans ---- */
 
 static void take(const struct geometry *truth, float *ret)
@@ -143,21 +216,44 @@ static void take(const struct geometry *truth, float *ret)
 		phantom_project(&phantom, truth, k, ret + (size_t)k * COLUMNS * ROWS);
 }
 
-/* Root mean square distance at the isocentre, mm, of points where two geometries show them, less what all share. */
-static double distance(const struct geometry *truth, const struct geometry *said)
-{
-	static const double points[4][3] = {{60, 0, 40}, {-60, 20, -40}, {0, -60, 30}, {10, 60, -30}};
-	double squares = 0;
+struct pair {
+	const struct geometry *truth, *said;
+};
+enum { POINTS = 4 };
 
-	for (int p = 0; p < 4; p++)
-		for (int k = 0; k < truth->count; k++) {
+/* Where two geometries show points, one of them moved as a whole: at the isocentre, mm. */
+static void distances(void *context, const double *motion, double *ret)
+{
+	static const double points[POINTS][3] = {{60, 0, 40}, {-60, 20, -40}, {0, -60, 30}, {10, 60, -30}};
+	const struct pair *pair = context;
+
+	for (int p = 0; p < POINTS; p++)
+		for (int k = 0; k < pair->truth->count; k++) {
+			const struct view moved = view_of_moved(&pair->said->views[k], motion);
 			double a[2], b[2];
 
-			project(&truth->views[k], points[p], a);
-			project(&said->views[k], points[p], b);
-			squares += pow(a[0] - b[0], 2) + pow(a[1] - b[1], 2);
+			project(&pair->truth->views[k], points[p], a);
+			project(&moved, points[p], b);
+			*ret++ = (a[0] - b[0]) * PIXEL * 620 / 1100;
+			*ret++ = (a[1] - b[1]) * PIXEL * 620 / 1100;
 		}
-	return sqrt(squares / (4. * truth->count)) * PIXEL * 620 / 1100;
+}
+
+/* Root mean square distance, mm, less what all views share: no scan tells where the object lies. */
+static double distance(const struct geometry *truth, const struct geometry *said)
+{
+	struct pair pair = {truth, said};
+	const struct least_squares problem = {.parameters = PATH_NUMBERS,
+					      .residuals = 2 * POINTS * truth->count,
+					      .context = &pair,
+					      .residuals_of = distances,
+					      .step = 1e-4,
+					      .most = 30};
+	double motion[PATH_NUMBERS] = {0}, rms;
+	struct error err;
+
+	ck_assert_int_eq(least_squares(&problem, motion, &rms, &err), 0);
+	return rms * sqrt(2);
 }
 
 struct found {
@@ -289,6 +385,8 @@ Suite *refine_suite(void)
 	tcase_add_test(paths, a_moved_object_is_seen_by_a_moved_view);
 	tcase_add_test(paths, more_knots_do_not_change_a_path);
 	tcase_add_loop_test(paths, a_step_finds_what_made_the_residuals, 0, 2);
+	tcase_add_test(paths, what_all_views_share_is_no_path);
+	tcase_add_test(paths, halved_bins_are_those_of_larger_ones);
 	suite_add_tcase(suite, paths);
 	tcase_set_timeout(scans, 300);
 	tcase_add_test(scans, a_detector_that_sways_is_found);
