@@ -459,12 +459,12 @@ cancel_it() {
 }
 test_large_jobs_go_to_a_faster_host_and_small_ones_stay_on_the_cart() {
 	local try
-	# So small that computing it is no part of the times, on a busy machine as well.
+	# So small that computing it is a small part of the times, on a busy machine as well.
 	local few='"grid": {"size": [16, 16, 8], "spacing_mm": [12, 12, 12]}'
 	local some="{\"scan\": \"SCAN\", $few, \"fdk\": {}, \"sart\": {\"iterations\": X, \"subsets\": 1}, \"emit\": []}"
 	begin
 	paced a 0 --fleet-address http://127.0.0.1:PORT
-	paced c 4
+	paced c 16
 	at c
 	post_scan "$scan_dir"
 	post_projections "$scan_dir"
@@ -481,14 +481,16 @@ test_large_jobs_go_to_a_faster_host_and_small_ones_stay_on_the_cart() {
 	done
 	wait_job succeeded
 	expect_json '.device | startswith("a: ")'
+	some=${some/16, 16, 8/8, 8, 4}
 	post_job "${some/X/1}"
 	wait_job succeeded
 	expect_json '.device | startswith("a: ") | not'
 	# Where bringing it takes longer than all of it here, it stays.
 	stop_host c
-	paced c 4 --fleet-link 1K
+	paced c 16 --fleet-link 1K
 	at c
 	sleep 2
+	some=${some/8, 8, 4/16, 16, 8}
 	post_job "${some/X/60}"
 	runs_on 'startswith("a: ") | not' || fail "it stays, got $(json .device)"
 	cancel_it
