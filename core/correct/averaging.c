@@ -15,7 +15,7 @@ enum { SETTLING_DISTANCES = 2, SHELLS_FROM = AVERAGING_DISTANCES + SETTLING_DIST
 enum { DISTANCES = SHELLS_FROM + SHELL_DISTANCES };
 /* D is told from noise where it is so many standard errors, and that of rows two apart divides where it is so many. */
 static const double CERTAIN = 4, WELL_KNOWN = 12;
-/* For objects of voxels the ratio from rows 0 apart is up to .143, that of neighbours .137; edges have .2 to .24. */
+/* For objects of voxels the ratio from rows 0 apart is up to .143, that of neighbours .137; edges have .17 to .24. */
 static const double TILTED = 0.88;
 
 void averaging_pixels(const struct orbit *orbit, const struct grid *grid, double ret_pixels[2])
@@ -60,7 +60,7 @@ enum { ALWAYS_PASSES = 2 };
 
 double averaging_part(double pixels)
 {
-	return pixels > ALWAYS_MOST ? 0 : fmin(1, fmax(0, (pixels - SETTLING_NONE) / 0.1));
+	return pixels > ALWAYS_MOST * (1 + 1e-9) ? 0 : fmin(1, fmax(0, (pixels - SETTLING_NONE) / 0.1));
 }
 
 double averaging_variance(double pixels, double ratio, double noise, double edges, double shells)
@@ -191,13 +191,18 @@ static void add_rows(const float *row, const float *other, int columns, int apar
 	}
 }
 
+static void add_sum(struct averaging_sum *to, const struct averaging_sum *from)
+{
+	to->product += from->product;
+	to->square += from->square;
+	to->count += from->count;
+}
+
 static void add_sums(struct averaging_sums *to, const struct averaging_sums *from)
 {
-	for (int k = 0; k < 2; k++) {
-		to->of_rows[k].product += from->of_rows[k].product;
-		to->of_rows[k].square += from->of_rows[k].square;
-		to->of_rows[k].count += from->of_rows[k].count;
-	}
+	for (int k = 0; k < 2; k++)
+		add_sum(&to->of_rows[k], &from->of_rows[k]);
+	add_sum(&to->own, &from->own);
 }
 
 int averaging_add(const float *view, int columns, int rows, int row_step, int apart, struct averaging_sums *sums,
@@ -215,6 +220,7 @@ int averaging_add(const float *view, int columns, int rows, int row_step, int ap
 	for (int i = 0; i < count; i++) {
 		const float *row = view + (size_t)i * (size_t)row_step * (size_t)columns;
 
+		add_rows(row, row, columns, apart, &of_rows[i].own);
 		for (int k = 0; k < 2 && i * row_step + k + 1 < rows; k++)
 			add_rows(row, row + (size_t)(k + 1) * (size_t)columns, columns, apart, &of_rows[i].of_rows[k]);
 	}
@@ -230,20 +236,20 @@ void averaging_distances(double pixels, int ret_distances[AVERAGING_DISTANCES])
 		ret_distances[i] = (int)fmax(1, i < 2 ? pixels / 2 : pixels) + i % 2;
 }
 
-/* D at a distance between two whole ones, by the power law through both; 0 where either is not above noise. */
-static double between(double distance, const struct averaging_sums *sums, int below, bool tilted)
+/* A function's value between two whole distances, by the power law through both; 0 where either is 0. */
+static double along_power_law(double distance, int below, const double values[2])
 {
 	const double along = log(distance / below) / log((below + 1.0) / below);
-	double logarithm = 0;
 
-	for (int i = 0; i < 2; i++) {
-		const double d = structure(&sums[i], tilted);
+	return values[0] > 0 && values[1] > 0 ? exp((1 - along) * log(values[0]) + along * log(values[1])) : 0;
+}
 
-		if (d == 0)
-			return 0;
-		logarithm += (i == 0 ? 1 - along : along) * log(d);
-	}
-	return exp(logarithm);
+/* D at a distance between two whole ones; 0 where either is not above noise. */
+static double between(double distance, const struct averaging_sums *sums, int below, bool tilted)
+{
+	const double values[2] = {structure(&sums[0], tilted), structure(&sums[1], tilted)};
+
+	return along_power_law(distance, below, values);
 }
 
 double averaging_ratio(double pixels, const struct averaging_sums sums[AVERAGING_DISTANCES])
@@ -260,6 +266,25 @@ double averaging_ratio(double pixels, const struct averaging_sums sums[AVERAGING
 			most = fmax(most, (tilted ? TILTED : 1) * half / whole);
 	}
 	return most;
+}
+
+double averaging_own_ratio(double pixels, const struct averaging_sums sums[AVERAGING_DISTANCES], double noise2)
+{
+	/* Noise is known within a quarter. */
+	static const double little = 0.3;
+	double values[AVERAGING_DISTANCES], half, whole;
+	int distances[AVERAGING_DISTANCES];
+
+	averaging_distances(pixels, distances);
+	for (int i = 0; i < AVERAGING_DISTANCES; i++) {
+		/* Of white noise a second difference has six times the variance. */
+		values[i] = mean(&sums[i].own) - 6 * noise2;
+		if (!(6 * noise2 < little * values[i]))
+			return 0;
+	}
+	half = along_power_law(fmax(1, pixels / 2), distances[0], values);
+	whole = along_power_law(fmax(1, pixels), distances[2], values + 2);
+	return whole > 0 ? TILTED * half / whole : 0;
 }
 
 void shells_distances(double pixels, int ret_distances[SHELL_DISTANCES])
@@ -424,6 +449,8 @@ static int widths_of_default(const struct correction_job *job, const struct stat
 
 	if (code < 0)
 		return code;
+	if (ratio > 0 && state->halves)
+		ratio = fmax(ratio, averaging_own_ratio(state->pixels[0], sums, squares.noise));
 	/* Of white noise a second difference has six times the variance. */
 	noise = squares.noise > 0 ? 6 * squares.noise / (6 * squares.noise + shown) : 0;
 	for (int i = 0; i < 2; i++)

@@ -61,7 +61,8 @@ struct averaging_mean averaging_mean(const struct recipe *recipe);
  * which they can from 2 pixels a voxel on. It is known by its variance, the smaller the less voxels would overshoot.
  * TV takes out what noise is, and with a wide mean what little of the object stands above it.
  *
- * Its variance in voxels' squares, that of both passes together. ratio: averaging_ratio, 0 where it is not known;
+ * Its variance in voxels' squares, that of both passes together. ratio: averaging_ratio, 0 where it is not known, or
+ * averaging_own_ratio where that is more;
  * noise: the share of the power of second differences that is noise, 0 .. 1; edges: settling_share, where neighbouring
  * pixels show edges that are not tilted, the mean is narrower up to 2 pixels a voxel; shells: shells_share, where bone
  * is thinner than voxels can hold it is as wide as with finer pixels. 0: no mean.
@@ -86,7 +87,7 @@ struct averaging_sums {
 	struct averaging_sum {
 		double product, square;
 		size_t count;
-	} of_rows[2]; /* one and two apart */
+	} of_rows[2], own; /* one and two apart; each row with itself, which has the noise */
 };
 /*
  * Adds one view's, [row][column], at a distance of `apart` columns, from every row_step-th row on; pairs with NaN are
@@ -111,6 +112,11 @@ double averaging_ratio(double pixels, const struct averaging_sums sums[AVERAGING
 enum { SHELL_DISTANCES = 4 };
 void shells_distances(double pixels, int ret_distances[SHELL_DISTANCES]);
 double shells_share(double pixels, const struct averaging_sums sums[SHELL_DISTANCES]);
+/*
+ * The same where neighbouring rows say little: outlines that are tilted everywhere, as a ball's. From each row with
+ * itself, less what noise of this variance adds; 0 where that is not little.
+ */
+double averaging_own_ratio(double pixels, const struct averaging_sums sums[AVERAGING_DISTANCES], double noise2);
 /* Share of a voxel's width, 0 .. 1, over which the mean goes. */
 double averaging_share(double ratio);
 
