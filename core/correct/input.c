@@ -99,13 +99,15 @@ int input_open(struct input *ret_input, const struct linearise *linearise, const
 		input.blank = calloc((size_t)geometry->count, sizeof(*input.blank));
 		input.content = calloc((size_t)geometry->count, sizeof(*input.content));
 		input.profiles = calloc((size_t)geometry->count, sizeof(*input.profiles));
+		input.strips = calloc((size_t)geometry->count, sizeof(*input.strips));
 		input.outliers = calloc((size_t)geometry->count, sizeof(*input.outliers));
 		input.steps = calloc((size_t)geometry->count, sizeof(*input.steps));
 		input.mended = calloc((size_t)geometry->count, sizeof(*input.mended));
 		input.defects = calloc((size_t)geometry->count, sizeof(*input.defects));
 		input.edges = calloc((size_t)geometry->count, sizeof(*input.edges));
-		if (input.blank == NULL || input.content == NULL || input.profiles == NULL || input.outliers == NULL ||
-		    input.steps == NULL || input.mended == NULL || input.defects == NULL || input.edges == NULL)
+		if (input.blank == NULL || input.content == NULL || input.profiles == NULL || input.strips == NULL ||
+		    input.outliers == NULL || input.steps == NULL || input.mended == NULL || input.defects == NULL ||
+		    input.edges == NULL)
 			code = error_set(err, ERR_NO_MEMORY, "no memory for a list of %d views", geometry->count);
 	}
 	if (code < 0)
@@ -133,6 +135,7 @@ void input_clear(struct input *input)
 	free(input->blank);
 	free(input->content);
 	free(input->profiles);
+	free(input->strips);
 	free(input->outliers);
 	free(input->steps);
 	free(input->mended);
@@ -390,6 +393,7 @@ int input_take(struct input *input, const struct backend *backend, struct plan *
 	input->log_air = counts.air_most > 0 ? logf(counts.air_most) : 0;
 	input->content[view] = look_at_line_integrals(input, samples, columns, rows,
 						      unusable_share(&counts, input->pixels), &input->profiles[view]);
+	narrow_look(&input->linearise, samples, (const int[2]){columns, rows}, input->log_air, &input->strips[view]);
 	if (is_dark(&counts, &input->content[view], input->pixels)) {
 		add_blank(input, view);
 		code = input_empty_slot(input, backend, to, slot, err);
@@ -477,7 +481,9 @@ static bool can_mend(const struct input *input, int view, bool keeps_all)
 /* The views between two steps. `skip`: views that are none of them; these are marked as well. */
 static int add_steps(struct input *input, bool *skip, const struct orbit *orbit, bool keeps_all, struct error *err)
 {
-	int code = steps_find(input->profiles, skip, orbit, input->steps, err);
+	const int columns = input->turned ? input->rows : input->columns;
+	const int pixels[2] = {columns, input->turned ? input->columns : input->rows};
+	int code = steps_find(input->profiles, input->strips, pixels, skip, orbit, input->steps, err);
 
 	for (int view = 0; view < orbit->count && code > 0; view++) {
 		struct step *step = &input->steps[view];

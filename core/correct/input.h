@@ -5,6 +5,7 @@
 #include "core/correct/content.h"
 #include "core/correct/defects.h"
 #include "core/correct/mend.h"
+#include "core/correct/narrow.h"
 #include "core/correct/outliers.h"
 
 /* Views of a job that keeps no projections which may have to be taken out of the FDK volume again, at most. */
@@ -28,8 +29,9 @@ struct input {
 	 * `empty` of them have good pixels, `left_out` of those are outliers, and `held_out` are held out.
 	 */
 	int *blank, empty, left_out, held_out;
-	/* [views of the scan], owned; the second one of input_settle. */
+	/* [views of the scan], owned; the last one of input_settle. */
 	struct view_profile *profiles;
+	struct view_strips *strips;
 	struct outlier *outliers;
 	/*
 	 * [views of the scan], owned, of input_settle: runs between two steps, and [mended_count] those of their views

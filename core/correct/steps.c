@@ -5,6 +5,7 @@
 #include <string.h>
 
 #include "core/correct/bands.h"
+#include "core/correct/narrow.h"
 #include "core/correct/order.h"
 #include "core/error.h"
 #include "core/select.h"
@@ -166,8 +167,8 @@ static int mark_dark_bands(const struct ring *ring, struct step *ret_steps)
 	return found;
 }
 
-int steps_find(const struct view_profile *views, const bool *skip, const struct orbit *orbit, struct step *ret_steps,
-	       struct error *err)
+int steps_find(const struct view_profile *views, const struct view_strips *strips, const int pixels[2],
+	       const bool *skip, const struct orbit *orbit, struct step *ret_steps, struct error *err)
 {
 	struct ring ring;
 	int found = 0, code = ring_open(&ring, views, skip, orbit, err);
@@ -179,6 +180,10 @@ int steps_find(const struct view_profile *views, const bool *skip, const struct 
 		found = bands_find(&ring, ret_steps, err);
 	if (ring.count >= VIEWS_LEAST && found >= 0)
 		found += mark_dark_bands(&ring, ret_steps);
+	if (ring.count >= VIEWS_LEAST && found >= 0 && strips != NULL) {
+		code = narrow_find(&ring, strips, pixels, ret_steps, err);
+		found = code < 0 ? code : found + code;
+	}
 	if (ring.count >= VIEWS_LEAST && found >= 0) {
 		code = order_find_shifts(&ring, ret_steps, err);
 		found = code < 0 ? code : found + code;

@@ -24,12 +24,15 @@ struct step {
 	float level;             /* line integral; INFINITY: the part has no good sample */
 };
 
+struct view_strips; /* core/correct/narrow.h */
+
 /*
- * Fills ret_steps [count of the orbit]; `skip` marks views to pass over. Returns how many views are in runs, 0 where
+ * Fills ret_steps [count of the orbit]; `skip` marks views to pass over. strips: [views], of a detector of so many
+ * pixels, columns and rows; NULL: no narrow bands are looked for. Returns how many views are in runs, 0 where
  * they are more than half of all; ERR_NO_MEMORY.
  */
-int steps_find(const struct view_profile *views, const bool *skip, const struct orbit *orbit, struct step *ret_steps,
-	       struct error *err);
+int steps_find(const struct view_profile *views, const struct view_strips *strips, const int pixels[2],
+	       const bool *skip, const struct orbit *orbit, struct step *ret_steps, struct error *err);
 
 /*
  * The level of a STEP_LEVEL by the blocks that are air in the good views on both sides. False where fewer than four

@@ -5,6 +5,7 @@
 #include <string.h>
 
 #include "core/correct/content.h"
+#include "core/correct/narrow.h"
 #include "core/correct/steps.h"
 #include "tests/unit/data.h"
 #include "tests/unit/scene.h"
@@ -187,7 +188,7 @@ START_TEST(views_between_two_steps_are_found)
 						  : 1,
 					 0);
 	}
-	ck_assert_int_eq(steps_find(profiles, skip, &orbit, steps, &err), rows[_i].found);
+	ck_assert_int_eq(steps_find(profiles, NULL, NULL, skip, &orbit, steps, &err), rows[_i].found);
 	for (int i = 0; i < views && rows[_i].found > 0 && 2 * rows[_i].count <= views; i++) {
 		const bool is_in = (i - rows[_i].first + views) % views < rows[_i].count;
 
@@ -207,6 +208,94 @@ START_TEST(views_between_two_steps_are_found)
 	free(profiles);
 	free(steps);
 	free(skip);
+}
+END_TEST
+
+/* Bands of a few columns or rows of a detector of 300 x 200 pixels are found at their very ends; two rods that turn
+ * with the body, or the edge of a plate, are none. */
+START_TEST(narrow_bands_are_found)
+{
+	static const struct {
+		int axis, first, end; /* pixels */
+		double step, apart;   /* degrees; a full turn */
+		int view, count, found;
+		double rods; /* line integral */
+	} rows[] = {
+	    {0, 120, 126, .69, 4, 20, 1, 1, 0},   /* half of the signal in one view */
+	    {0, 120, 126, .69, 4, 80, 18, 18, 0}, /* over the end of the turn */
+	    {0, 230, 233, 2.3, 4, 30, 10, 10, 0},
+	    {0, 150, 180, -.5, 4, 30, 10, 10, 0}, /* a tenth of the columns, brighter */
+	    {0, 120, 126, .69, 4, 20, 4, 4, .3},  /* beside rods */
+	    {1, 90, 93, .69, 4, 20, 1, 1, 0},
+	    {1, 40, 60, .36, 4, 30, 18, 18, 0},
+	    {1, 90, 93, 2.3, 6, 20, 18, 18, 1.5},
+	    {0, 120, 126, .1, 4, 20, 18, 0, 0},  /* less than is told */
+	    {0, 120, 126, .69, 4, 20, 40, 0, 0}, /* over 160 degrees */
+	    {0, 120, 126, .69, 12, 20, 4, 0, 0}, /* views that are too far apart */
+	    {0, 0, 0, 0, 2, 0, 0, 0, 4},
+	    {0, 0, 0, 0, 4, 0, 0, 0, 4},
+	    {0, 0, 0, 0, 8, 0, 0, 0, 4},
+	};
+	enum { WIDE = 300, HIGH = 200 };
+	const int views = (int)lround(360 / rows[_i].apart), pixels[2] = {WIDE, HIGH};
+	const struct orbit_spec spec = {8, 8, views, {600, 1100, {10, 10}, {0, 0}, {0, 0}}, 30, rows[_i].apart};
+	const struct band none = {{0, 0}, {0, 0}, 0};
+	const struct linearise linearise = {.sample = SAMPLE_FLOAT32};
+	struct view_profile *profiles = calloc((size_t)views, sizeof(*profiles));
+	struct view_strips *strips = calloc((size_t)views, sizeof(*strips));
+	struct step *steps = calloc((size_t)views, sizeof(*steps));
+	bool *skip = calloc((size_t)views, sizeof(*skip));
+	float *view = malloc(sizeof(*view) * WIDE * HIGH);
+	struct scene scene;
+	struct orbit orbit;
+	struct error err;
+
+	scene_orbit(&scene, &spec);
+	ck_assert_int_eq(orbit_analyse(&orbit, &scene.geometry, &err), 0);
+	random_state = (unsigned)_i;
+	for (int i = 0; i < views; i++) {
+		const double angle = (30 + i * rows[_i].apart) * acos(-1) / 180;
+		const bool is_in = (i - rows[_i].view + views) % views < rows[_i].count;
+
+		for (int at = 0; at < WIDE * HIGH; at++) {
+			const int place[2] = {at % WIDE, at / WIDE}, across = place[rows[_i].axis];
+			double p =
+			    (double)body_at((place[0] + .5) / WIDE, (place[1] + .5) / HIGH, angle) + .02 * normal();
+
+			for (int rod = 0; rod < 2; rod++)
+				p += fabs(place[0] - WIDE * (.5 + (.1 + .15 * rod) * sin(angle + rod))) < 4 - rod
+					 ? rows[_i].rods
+					 : 0;
+			/* a plate of 60 pixels by 3 */
+			p += fabs(place[0] - WIDE * (.5 + .2 * cos(angle))) < fmax(1.5, 30 * fabs(sin(angle)))
+				 ? .2 * rows[_i].rods * 3 / fmax(3, 60 * fabs(sin(angle)))
+				 : 0;
+			view[at] =
+			    (float)(p +
+				    (is_in && across >= rows[_i].first && across < rows[_i].end ? rows[_i].step : 0));
+		}
+		profiles[i] = profile_at(angle, &none, 0, 0);
+		narrow_look(&linearise, view, pixels, 0, &strips[i]);
+	}
+	ck_assert_int_eq(steps_find(profiles, strips, pixels, skip, &orbit, steps, &err), rows[_i].found);
+	for (int i = 0; i < views && rows[_i].found > 0; i++) {
+		const double size = pixels[rows[_i].axis];
+
+		ck_assert_msg((steps[i].kind == STEP_PART) == ((i - rows[_i].view + views) % views < rows[_i].count),
+			      "row %d: view %d", _i, i);
+		if (steps[i].kind == STEP_NONE)
+			continue;
+		ck_assert_double_eq_tol(steps[i].first[rows[_i].axis] * size, rows[_i].first, 1.5);
+		ck_assert_double_eq_tol(steps[i].end[rows[_i].axis] * size, rows[_i].end, 1.5);
+		ck_assert_double_eq_tol((double)steps[i].level, rows[_i].step, .1 * fabs(rows[_i].step));
+	}
+	orbit_clear(&orbit);
+	scene_clear(&scene);
+	free(profiles);
+	free(strips);
+	free(steps);
+	free(skip);
+	free(view);
 }
 END_TEST
 
@@ -243,7 +332,7 @@ START_TEST(runs_of_views_that_lie_aside_are_found)
 		profiles[i] = profile_at((30 + i * rows[_i].apart) * acos(-1) / 180, &none, 0,
 					 place < rows[_i].count ? part * rows[_i].aside : 0);
 	}
-	ck_assert_int_eq(steps_find(profiles, skip, &orbit, steps, &err), rows[_i].found);
+	ck_assert_int_eq(steps_find(profiles, NULL, NULL, skip, &orbit, steps, &err), rows[_i].found);
 	for (int i = 0; i < views && rows[_i].found > 0; i++)
 		ck_assert_msg((steps[i].kind == STEP_ASIDE) == ((i - rows[_i].first + views) % views < rows[_i].count),
 			      "row %d: view %d", _i, i);
@@ -627,6 +716,7 @@ Suite *content_suite(void)
 	tcase_set_timeout(tests, 60);
 	tcase_add_loop_test(search, a_gap_among_views_of_an_object_is_found, 0, 2);
 	tcase_add_loop_test(search, views_between_two_steps_are_found, 0, 23);
+	tcase_add_loop_test(search, narrow_bands_are_found, 0, 14);
 	tcase_add_loop_test(search, runs_of_views_that_lie_aside_are_found, 0, 9);
 	tcase_add_loop_test(tests, views_that_show_nothing_are_told_and_left_out, 0, TRIES);
 	tcase_add_loop_test(tests, views_that_do_not_follow_are_told_and_left_out, 0, 2 * OUTLYING);
