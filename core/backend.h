@@ -141,6 +141,7 @@ struct plan_options {
 	bool no_projection; /* neither project nor sart_iterate will be asked for: no scratch for them */
 	int resident;       /* slots of the stacks that are on the device beside the plan; 0: one for each view */
 	bool unbounded;     /* no bound of its own is kept beside the device's: a part of a job whose whole has one */
+	int together;       /* views that sart_correct and sart_take are asked for at a time, at most; 0: none */
 };
 
 /* Bytes, known before anything is allocated. */
@@ -342,13 +343,28 @@ struct backend {
 	 * another one.
 	 */
 	/*
-	 * Slot i of `rays`, the projection of a volume, becomes (p - A v) / L: p is slot slots[i] of `projections`, L
-	 * the length of the rays of views[i] in `grid`, of the whole volume, which is centred where the plan's is. The
-	 * rest is as with sart_iterate; the sums are over these rays.
+	 * Slot i of `rays`, the projection of a volume, becomes (p - A v) / L: p is slot views[i] of `measured`, L the
+	 * length of the rays of views[i] in `grid`, of the whole volume. The rest is as with sart_iterate. Squares are
+	 * kept for sart_sums of all rows but those from left_out[0] to left_out[1] - 1; `before` views of the iteration
+	 * have been corrected already.
 	 */
 	int (*sart_correct)(struct plan *plan, const struct geometry *geometry, const struct grid *grid,
-			    const struct stack *projections, const int *slots, const int *views, int count,
-			    struct stack *rays, struct iteration_sums *ret_sums, struct error *err);
+			    const struct stack *measured, const int *views, int count, const int left_out[2],
+			    int before, struct stack *rays, struct error *err);
+	/* Over the rays of the `count` views that have been corrected since the iteration began; waits for them. */
+	int (*sart_sums)(struct plan *plan, int count, struct iteration_sums *ret_sums, struct error *err);
+	/* Sum of squares of slots 0 .. count - 1, but of rows left_out and of what is no number. */
+	int (*sart_squares)(struct plan *plan, const struct stack *stack, int count, const int left_out[2],
+			    double *ret_sum, struct error *err);
+	/* All views see all of the plan's grid: column sums are numbers of views. NULL: nobody looks. */
+	bool (*sart_covered)(const struct plan *plan);
+	/*
+	 * The update from slots of `rays` in one go: v += relaxation * (their plain backprojection) / coverage, as
+	 * sart_update; coverage is not looked at where sart_covered. NULL: by backproject and sart_update.
+	 */
+	int (*sart_take)(struct plan *plan, const struct sart_options *options, double least, const struct stack *rays,
+			 const int *views, int count, const struct volume *coverage, struct volume *volume,
+			 struct error *err);
 	/* Column sums: to = sum over i of w_ij of the rays of views[i], as plain `backproject` has of ones. */
 	int (*sart_coverage)(struct plan *plan, const int *views, int count, struct volume *to, struct error *err);
 	/* v += relaxation sums / coverage, where coverage is divided by as `least` if it is smaller, and not at all at

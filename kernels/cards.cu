@@ -135,14 +135,15 @@ int cuda_volume_pass(const struct volume *from, int z_from, struct volume *to, i
 
 struct correction_job {
 	const struct device_view *geometry;
-	const int *views, *slots; /* [count] */
-	float *rays;
+	const int *views; /* [count] */
+	float *rays;      /* NULL: nothing is projected, and nothing becomes of it */
 	const float *measured;
 	int columns, rows, pitch;
 	size_t slot;
-	float half[3], mm[3]; /* of the box from its centre, voxels; of a voxel */
-	float least;          /* mm */
-	float2 *partial;      /* [count][gridDim.x] */
+	int left_out[2];                 /* rows of which no squares are kept, from and to */
+	float centre[3], half[3], mm[3]; /* of the box: its centre, from there, voxels; of a voxel */
+	float least;                     /* mm */
+	float2 *partial;                 /* [count][gridDim.x] */
 };
 
 /* mm of the ray that lie in the box; d from the source s to the pixel, voxels. */
@@ -152,16 +153,16 @@ static __device__ __forceinline__ float length_inside(const correction_job &job,
 	float length2 = 0;
 
 	for (int i = 0; i < 3; i++) {
-		float mm = d[i] * job.mm[i];
+		float mm = d[i] * job.mm[i], from = s[i] - job.centre[i];
 
 		length2 = fmaf(mm, mm, length2);
 		if (d[i] == 0) {
-			if (fabsf(s[i]) > job.half[i])
+			if (fabsf(from) > job.half[i])
 				return 0;
 			continue;
 		}
-		double inverse = 1.0 / (double)d[i], a = ((double)-job.half[i] - (double)s[i]) * inverse;
-		double b = ((double)job.half[i] - (double)s[i]) * inverse;
+		double inverse = 1.0 / (double)d[i], a = ((double)-job.half[i] - (double)from) * inverse;
+		double b = ((double)job.half[i] - (double)from) * inverse;
 
 		begin = fmax(begin, fmin(a, b));
 		end = fmin(end, fmax(a, b));
@@ -169,28 +170,40 @@ static __device__ __forceinline__ float length_inside(const correction_job &job,
 	return end > begin ? (float)(end - begin) * sqrtf(length2) : 0.0f;
 }
 
+/* The correction of one ray, whose squares are added to the sum. */
+static __device__ __forceinline__ void correct_pixel(const correction_job &job, const struct device_view *view,
+						     int column, int row, const float *measured, float *rays,
+						     float2 &sum)
+{
+	size_t at = (size_t)row * job.pitch + column;
+	float p = measured[at], difference = rays != NULL ? p - rays[at] : p;
+
+	if (isnan(p)) /* RAY_LEFT_OUT */
+		p = difference = 0;
+	if (row < job.left_out[0] || row >= job.left_out[1]) {
+		sum.x = fmaf(difference, difference, sum.x);
+		sum.y = fmaf(p, p, sum.y);
+	}
+	if (rays == NULL)
+		return;
+	float c = column - 0.5f * (job.columns - 1), r = row - 0.5f * (job.rows - 1), d[3];
+
+	for (int k = 0; k < 3; k++)
+		d[k] = fmaf(view->direction[k][2], r, fmaf(view->direction[k][1], c, view->direction[k][0]));
+	float length = length_inside(job, view->source, d);
+	rays[at] = length > 0 && length >= job.least ? difference / length : 0.0f;
+}
+
 static __global__ void __launch_bounds__(THREADS) correct(const correction_job job)
 {
 	__shared__ float2 warps[THREADS / 32];
-	const struct device_view *view = job.geometry + job.views[blockIdx.y];
-	const float *measured = job.measured + (size_t)job.slots[blockIdx.y] * job.slot;
-	float *rays = job.rays + (size_t)blockIdx.y * job.slot;
+	const int number = job.views != NULL ? job.views[blockIdx.y] : (int)blockIdx.y;
+	const float *measured = job.measured + (size_t)number * job.slot;
+	float *rays = job.rays != NULL ? job.rays + (size_t)blockIdx.y * job.slot : NULL;
 	float2 sum = make_float2(0, 0);
 
-	for (int i = blockIdx.x * THREADS + threadIdx.x; i < job.columns * job.rows; i += gridDim.x * THREADS) {
-		int column = i % job.columns, row = i / job.columns;
-		size_t at = (size_t)row * job.pitch + column;
-		float c = column - 0.5f * (job.columns - 1), r = row - 0.5f * (job.rows - 1), d[3], p = measured[at];
-
-		for (int k = 0; k < 3; k++)
-			d[k] = fmaf(view->direction[k][2], r, fmaf(view->direction[k][1], c, view->direction[k][0]));
-		float length = length_inside(job, view->source, d), difference = p - rays[at];
-		if (isnan(p)) /* RAY_LEFT_OUT */
-			p = difference = 0;
-		sum.x = fmaf(difference, difference, sum.x);
-		sum.y = fmaf(p, p, sum.y);
-		rays[at] = length > 0 && length >= job.least ? difference / length : 0.0f;
-	}
+	for (int i = blockIdx.x * THREADS + threadIdx.x; i < job.columns * job.rows; i += gridDim.x * THREADS)
+		correct_pixel(job, job.geometry + number, i % job.columns, i / job.columns, measured, rays, sum);
 	for (int lane = 16; lane > 0; lane >>= 1) {
 		sum.x += __shfl_down_sync(~0u, sum.x, lane);
 		sum.y += __shfl_down_sync(~0u, sum.y, lane);
@@ -214,44 +227,110 @@ size_t rays_partials(const struct plan *plan)
 	return (size_t)plan->options.geometry->count * CORRECT_BLOCKS;
 }
 
-int cuda_sart_correct(struct plan *plan, const struct geometry *geometry, const struct grid *grid,
-		      const struct stack *projections, const int *slots, const int *views, int count,
-		      struct stack *rays, struct iteration_sums *ret_sums, struct error *err)
+static int correct_job(struct plan *plan, const struct stack *measured, const int left_out[2], int before, int count,
+		       correction_job *ret_job, struct error *err)
 {
-	const double *mm = grid->spacing;
-	struct device *device = plan->device;
 	correction_job job = {};
 
-	(void)geometry;
-	if (plan->rays_partial == NULL)
-		return error_set(err, ERR_INTERNAL, "the plan was made without corrections of rays");
-	TRY(device_enter(device, err));
-	TRY(plan_check_views(plan, views, count, &plan->stack, rays, count, err));
-	TRY(plan_set_views(plan, views, count, err));
-	TRY(plan_set_slots(plan, slots, count, projections, err));
+	if (plan->rays_partial == NULL || before + count > plan->options.geometry->count)
+		return error_set(err, ERR_INTERNAL, "the plan was made without corrections of %d rays", before + count);
 	job.geometry = plan->geometry;
-	job.views = plan->views;
-	job.slots = plan->slots;
-	job.rays = rays->data;
-	job.measured = projections->data;
+	job.measured = measured->data;
 	job.columns = plan->stack.columns;
 	job.rows = plan->stack.rows;
 	job.pitch = plan->stack.pitch;
 	job.slot = plan->stack.slot;
+	job.left_out[0] = left_out[0];
+	job.left_out[1] = left_out[1];
+	job.partial = plan->rays_partial + (size_t)before * CORRECT_BLOCKS;
+	*ret_job = job;
+	return device_enter(plan->device, err);
+}
+
+static double centre_of(const struct grid *grid, int axis)
+{
+	return grid->origin[axis] + 0.5 * (grid->size[axis] - 1) * grid->spacing[axis];
+}
+
+int cuda_sart_correct(struct plan *plan, const struct geometry *geometry, const struct grid *grid,
+		      const struct stack *measured, const int *views, int count, const int left_out[2], int before,
+		      struct stack *rays, struct error *err)
+{
+	const double *mm = grid->spacing;
+	struct device *device = plan->device;
+	correction_job job;
+
+	(void)geometry;
+	TRY(correct_job(plan, measured, left_out, before, count, &job, err));
+	TRY(plan_check_views(plan, views, count, &plan->stack, rays, count, err));
+	TRY(plan_set_views(plan, views, count, err));
+	job.views = plan->views;
+	job.rays = rays->data;
 	for (int i = 0; i < 3; i++) {
+		job.centre[i] = (float)((centre_of(grid, i) - centre_of(plan->options.grid, i)) / mm[i]);
 		job.half[i] = 0.5f * (float)grid->size[i];
 		job.mm[i] = (float)mm[i];
 	}
 	job.least = (float)(RAY_LENGTH_LEAST * fmin(fmin(mm[0], mm[1]), mm[2]));
-	job.partial = plan->rays_partial;
 	correct<<<dim3(CORRECT_BLOCKS, count), THREADS, 0, device->stream>>>(job);
 	LAUNCHED();
-	TRY(reduce_pairs(plan, job.partial, (size_t)count * CORRECT_BLOCKS, device->sums_device, device->stream, err));
-	TRY(mark_used(device, projections->used, err));
-	TRY(mark_used(device, rays->used, err));
+	TRY(mark_used(device, measured->used, err));
+	return mark_used(device, rays->used, err);
+}
+
+int cuda_sart_sums(struct plan *plan, int count, struct iteration_sums *ret_sums, struct error *err)
+{
+	struct device *device = plan->device;
+
+	TRY(device_enter(device, err));
+	TRY(reduce_pairs(plan, plan->rays_partial, (size_t)count * CORRECT_BLOCKS, device->sums_device, device->stream,
+			 err));
 	TRY(device_wait(device, err));
 	*ret_sums = {device->sums[0], device->sums[1]};
 	return 0;
+}
+
+int cuda_sart_squares(struct plan *plan, const struct stack *stack, int count, const int left_out[2], double *ret_sum,
+		      struct error *err)
+{
+	struct iteration_sums sums;
+	correction_job job;
+
+	TRY(correct_job(plan, stack, left_out, 0, count, &job, err));
+	correct<<<dim3(CORRECT_BLOCKS, count), THREADS, 0, plan->device->stream>>>(job);
+	LAUNCHED();
+	TRY(mark_used(plan->device, stack->used, err));
+	TRY(cuda_sart_sums(plan, count, &sums, err));
+	*ret_sum = sums.projection2;
+	return 0;
+}
+
+bool cuda_sart_covered(const struct plan *plan)
+{
+	return plan->shape.covered;
+}
+
+int cuda_sart_take(struct plan *plan, const struct sart_options *options, double least, const struct stack *rays,
+		   const int *views, int count, const struct volume *coverage, struct volume *volume, struct error *err)
+{
+	struct device *device = plan->device;
+	struct voxel_use use = {};
+
+	if (plan->options.together == 0 || count > plan->options.together)
+		return error_set(err, ERR_INTERNAL, "the plan was made for %d views together, not %d",
+				 plan->options.together, count);
+	TRY(plan_check_views(plan, views, count, &plan->stack, rays, count, err));
+	TRY(plan_set_views(plan, views, count, err));
+	use.update = true;
+	use.nonnegative = options->nonnegative;
+	use.scale = (float)(plan->shape.covered ? options->relaxation / count : options->relaxation);
+	use.coverage = plan->shape.covered ? NULL : coverage->data;
+	use.least = (float)least;
+	TRY(backproject_views(plan, rays->data, 0, count, use, volume->data, err));
+	TRY(mark_used(device, rays->used, err));
+	if (use.coverage != NULL)
+		TRY(mark_used(device, coverage->used, err));
+	return mark_used(device, volume->used, err);
 }
 
 int cuda_sart_coverage(struct plan *plan, const int *views, int count, struct volume *to, struct error *err)

@@ -586,8 +586,15 @@ int cuda_project(struct plan *plan, const struct volume *from, const int *views,
 int cuda_sart_iterate(struct plan *plan, const struct stack *projections, struct volume *volume,
 		      const struct cancel *cancel, struct iteration_sums *ret_sums, struct error *err);
 int cuda_sart_correct(struct plan *plan, const struct geometry *geometry, const struct grid *grid,
-		      const struct stack *projections, const int *slots, const int *views, int count,
-		      struct stack *rays, struct iteration_sums *ret_sums, struct error *err);
+		      const struct stack *measured, const int *views, int count, const int left_out[2], int before,
+		      struct stack *rays, struct error *err);
+int cuda_sart_sums(struct plan *plan, int count, struct iteration_sums *ret_sums, struct error *err);
+int cuda_sart_squares(struct plan *plan, const struct stack *stack, int count, const int left_out[2], double *ret_sum,
+		      struct error *err);
+bool cuda_sart_covered(const struct plan *plan);
+int cuda_sart_take(struct plan *plan, const struct sart_options *options, double least, const struct stack *rays,
+		   const int *views, int count, const struct volume *coverage, struct volume *volume,
+		   struct error *err);
 int cuda_sart_coverage(struct plan *plan, const int *views, int count, struct volume *to, struct error *err);
 int cuda_sart_update(const struct sart_options *options, double least, const struct volume *sums,
 		     const struct volume *coverage, struct volume *volume, struct error *err);

@@ -390,7 +390,8 @@ static bool needs_arrays_back(const struct plan *plan)
 {
 	const struct plan_options *options = &plan->options;
 	/* FDK needs no arrays for rows that lean, plain sums do. */
-	bool sums = plan->shape.correction > 0 || (options->sart == NULL && options->column_weights == NULL);
+	bool sums = plan->shape.correction > 0 || options->together > 0 ||
+		    (options->sart == NULL && options->column_weights == NULL);
 
 	return plan->shape.textures && !back_by_pairs(plan, false) && (plan->shape.back_voxels == 0 || sums);
 }
@@ -419,15 +420,16 @@ static size_t ones_bytes(const struct plan *plan)
 /* Views of a batch that is laid out anew for the backprojection. */
 static int views_laid_out(const struct plan *plan)
 {
-	int views = plan->shape.batch;
+	int views = plan->shape.batch, subset = plan->shape.correction;
 
+	if (plan->options.together > subset)
+		subset = plan->options.together;
 	/*
 	 * Pairs of float take twice a stack's room: a batch must do. Else all of a subset is taken, to need no sums
 	 * aside; the matched projector's corrections are not laid out.
 	 */
-	if ((plan->shape.back_voxels == 0 || plan->shape.back_pairs) && plan->shape.correction > views &&
-	    !plan->options.matched)
-		views = plan->shape.correction;
+	if ((plan->shape.back_voxels == 0 || plan->shape.back_pairs) && subset > views && !plan->options.matched)
+		views = subset;
 	if (plan->shape.thrift == THRIFT_HALVES)
 		views = divide_up(views, 2);
 	return at_most(views, plan->shape.views_at_once);
@@ -509,11 +511,25 @@ static void plan_describe(struct plan *plan, const struct plan_options *options,
 
 static bool needs_work(const struct plan *plan)
 {
-	return plan->shape.parts || (plan->shape.correction > plan->shape.views_at_once && !plan->options.matched);
+	int subset = plan->shape.correction > plan->options.together ? plan->shape.correction : plan->options.together;
+
+	return plan->shape.parts || (subset > plan->shape.views_at_once && !plan->options.matched);
 }
 static bool needs_coverage(const struct plan *plan)
 {
 	return plan->shape.correction > 0 && !plan->shape.covered;
+}
+
+/* What a part of an iteration needs that several devices share. */
+static void shared_walk(struct plan *plan, struct arena *arena)
+{
+	take(arena, &plan->rays_partial, rays_partials(plan));
+	if (plan->options.together == 0)
+		return;
+	if (!plan->shape.covered)
+		take(arena, &plan->ones, ones_bytes(plan));
+	if (needs_work(plan))
+		take(arena, &plan->work, grid_voxels(plan->options.grid));
 }
 
 /* SART's part of the plan's memory: column sums, numerators, squares, and that of its strategy. */
@@ -551,8 +567,8 @@ static void plan_walk(struct plan *plan, struct arena *arena)
 	linearise_walk(plan, arena);
 	if (plan->strategy != NULL)
 		sart_walk(plan, arena);
-	else if (plan->options.no_projection)
-		take(arena, &plan->rays_partial, rays_partials(plan));
+	else if (plan->options.no_projection || plan->options.together > 0)
+		shared_walk(plan, arena);
 	if (plan->options.column_weights != NULL)
 		filter_walk(plan, arena);
 }
@@ -736,8 +752,6 @@ static int prepare_sart(struct plan *plan, struct error *err)
 	CUDA_TRY(cudaEventCreateWithFlags(&plan->projected, cudaEventDisableTiming));
 	CUDA_TRY(cudaEventCreateWithFlags(&plan->summed, cudaEventDisableTiming));
 	plan->coverage_subset = -1;
-	if (plan->ones != NULL)
-		TRY(layout_ones(plan, err));
 	return plan->strategy->prepare(plan, err);
 }
 
@@ -782,6 +796,8 @@ static int plan_prepare(struct plan *plan, struct error *err)
 	TRY(plan_allocate(plan, err));
 	TRY(upload_views(plan, NULL, plan->geometry, err));
 	TRY(linearise_prepare(plan, err));
+	if (plan->ones != NULL)
+		TRY(layout_ones(plan, err));
 	if (plan->strategy != NULL)
 		TRY(prepare_sart(plan, err));
 	if (plan->filter != NULL)

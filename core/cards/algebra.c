@@ -92,6 +92,7 @@ int cards_volume_maximum(double a, const struct volume *x, struct volume *y, str
 
 static int run_stacks(crew_work *work, struct operands *operands, struct error *err)
 {
+	stack_written(operands->y);
 	return crew_run(operands->y->device->crew, work, operands, err);
 }
 
@@ -211,6 +212,8 @@ int cards_stack_average(struct stack *y, int slot, const double width[2], struct
 	const struct device *device = y->device;
 	const int c = slot_card(device, slot);
 
+	stack_written(y);
+	stack_written(work);
 	return device->backend->stack_average(y->part[c], slot_place(device, slot), width, work->part[c], err);
 }
 
@@ -261,7 +264,7 @@ int cards_stack_dot(struct plan *plan, const struct stack *w, const struct stack
 		    double *ret_sum, struct error *err)
 {
 	struct operands operands = {.plan = plan, .w = w, .x = x, .y = (struct stack *)(void *)y, .count = count};
-	int code = run_stacks(stack_dot, &operands, err);
+	int code = crew_run(y->device->crew, stack_dot, &operands, err);
 
 	if (code == 0)
 		*ret_sum = total(&operands, plan->device->count);

@@ -355,6 +355,7 @@ static int cards_stack_new(struct device *device, int columns, int rows, int slo
 	if (stack == NULL)
 		return error_set(err, ERR_NO_MEMORY, "no memory for a stack");
 	*stack = (struct stack){.device = device, .columns = columns, .rows = rows, .slots = slots};
+	stack_written(stack);
 	for (int c = 0; c < device->count && code == 0; c++)
 		code = device->backend->stack_new(device->card[c], columns, rows, slot_place(device, slots - 1) + 1,
 						  &stack->part[c], err);
@@ -421,6 +422,7 @@ static int cards_stack_upload(struct stack *stack, int slot, int count, const fl
 	struct slots slots = {.stack = stack, .slot = slot, .count = count, .from = from};
 	int code = check_slots(stack, slot, count, err);
 
+	stack_written(stack);
 	return code < 0 ? code : crew_run(stack->device->crew, slots_part, &slots, err);
 }
 

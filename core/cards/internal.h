@@ -12,8 +12,9 @@ struct device {
 	const struct backend *backend; /* the one below */
 	int count;
 	struct device *card[CARDS_MOST];
-	bool shared;    /* the cards are shares of one memory, with no limit each */
-	bool connected; /* they pass stacks and slices to each other without the host */
+	bool shared;            /* the cards are shares of one memory, with no limit each */
+	bool connected;         /* they pass stacks and slices to each other without the host */
+	unsigned long writings; /* counts the writings to stacks */
 	struct crew *crew;
 };
 
@@ -29,8 +30,15 @@ struct volume {
 struct stack {
 	struct device *device;
 	int columns, rows, slots;
+	unsigned long written; /* the last writing to it, of device->writings: its contents have a number */
 	struct stack *part[CARDS_MOST];
 };
+
+/* Called by whatever writes to a stack. */
+static inline void stack_written(struct stack *stack)
+{
+	stack->written = ++stack->device->writings;
+}
 
 static inline int slot_place(const struct device *device, int slot)
 {
@@ -86,22 +94,28 @@ struct card_plan {
 	struct stack *in[2];   /* [batch] of these rows, in turn */
 	struct stack *wide[2]; /* the same of filtered rows, where they are longer */
 	struct stack *taken;   /* views to be filtered here that lie elsewhere */
-	struct stack *rays;    /* SART: of the views of a subset whose projections lie here */
+	/* SART: these rows of all measured projections, and which of them other cards have that come before. */
+	struct stack *measured;
+	int counted_before[2];
 	struct volume *sums, *coverage;
 	int *from, *to, *views; /* [count], lists */
+	float *host;            /* where nothing is connected: two views, or two slices */
 };
 
 struct plan {
 	struct device *device;
 	struct plan_options options;
 	struct grid one;
-	int parts;                       /* cards that have a slab */
-	int batch;                       /* views that a card projects or backprojects in one go */
-	int filter_batch, rays, covered; /* slots of taken and rays; subset whose column sums are there, -1: none */
+	int parts;                 /* cards that have a slab */
+	int batch;                 /* views that a card projects or backprojects in one go */
+	int filter_batch, covered; /* slots of taken; subset whose column sums are there, -1: none */
+	int seen[2];               /* rows that any slab is seen by: from and to */
+	unsigned long measured;    /* the contents that the cards' `measured` have; 0: none */
+	double unseen;             /* squares of the rows that see no slab */
 	struct card_plan card[CARDS_MOST];
 	struct place *places; /* [count], of the views in hand */
 	int *lists;           /* all cards' */
-	float *host;          /* where nothing is connected: two views, or two slices */
+	float *host;          /* all cards' */
 	char summary[320];
 };
 
@@ -142,6 +156,11 @@ int project_through(struct plan *plan, const struct volume *from, const int *vie
 static inline bool goes_between(const struct plan *plan, enum backprojection weight)
 {
 	return plan->options.matched && weight == BACKPROJECT_PLAIN;
+}
+/* Views of a batch, of so many. */
+static inline int batch_of(const struct plan *plan, int count)
+{
+	return count < plan->batch ? count : plan->batch;
 }
 /* The slab from and to its place between slices of zeros; the second leaves zeros there. */
 int slab_enter(struct plan *plan, int c, const struct volume *from, struct error *err);

@@ -11,10 +11,10 @@
 #include "core/fdk.h"
 
 /*
- * Bytes of a card's stack for a batch of views, two of which take turns: far above what hides a launch, far below a
- * card's memory. A fixed number, so that the batches and the bits do not go by what is free.
+ * Bytes of a card's stack for a batch of views, of which there are two: SIRT of 512^3 and 1024^3 takes its views in one
+ * go, which saves passes over the slab. A fixed number, so that the batches and the bits do not go by what is free.
  */
-static const size_t BATCH_BYTES = (size_t)512 << 20;
+static const size_t BATCH_BYTES = (size_t)1100 << 20;
 
 static struct grid grid_of_slices(const struct grid *grid, int first, int count)
 {
@@ -63,7 +63,7 @@ static void rows_seen(const struct geometry *geometry, const struct grid *grid, 
 {
 	const int margin = 2, least = 8;
 	double low = INFINITY, high = -INFINITY;
-	int first = 0, end = geometry->rows;
+	int first, end;
 
 	for (int i = 0; i < geometry->count; i++) {
 		if (!rows_of_view(&geometry->views[i], grid, &low, &high)) {
@@ -71,14 +71,11 @@ static void rows_seen(const struct geometry *geometry, const struct grid *grid, 
 			high = INFINITY;
 		}
 	}
-	low = fmax(0, floor(low) - margin);
+	low = fmin(fmax(0, floor(low) - margin), geometry->rows - 1);
 	high = fmin(geometry->rows, ceil(high) + margin + 1);
-	if (low < high) {
-		first = (int)low;
-		end = (int)high;
-	} else { /* no view sees it */
-		end = first + 1;
-	}
+	/* Where no view sees it, one row at that end: neighbouring slabs leave no row between theirs. */
+	first = (int)low;
+	end = low < high ? (int)high : first + 1;
 	while (end - first < least && (first > 0 || end < geometry->rows)) {
 		first -= first > 0;
 		end += end < geometry->rows;
@@ -210,6 +207,7 @@ static int walk_slab(struct plan *plan, int c, struct walk *walk, struct error *
 		options.filter_response = all->filter_response;
 		memcpy(options.pad, all->pad, sizeof(options.pad));
 	}
+	options.together = all->sart != NULL ? batch_of(plan, subsets_largest(&all->sart->subsets)) : 0;
 	code = walk_plan(walk, &options, &card->slab, err);
 	if (code == 0 && (!all->no_projection || all->matched)) {
 		options = plain_options(plan, &card->geometry, &card->between_grid, 2 * plan->batch);
@@ -246,7 +244,9 @@ static int walk_stacks(struct plan *plan, int c, struct walk *walk, struct error
 	}
 	if (code == 0)
 		code = walk_stack(walk, columns, rows, plan->filter_batch, &card->taken, err);
-	return code == 0 ? walk_stack(walk, columns, rows, plan->rays, &card->rays, err) : code;
+	return code == 0 && c < plan->parts && plan->options.sart != NULL
+		   ? walk_stack(walk, columns, card->geometry.rows, plan->options.geometry->count, &card->measured, err)
+		   : code;
 }
 
 static int walk_card(struct plan *plan, int c, struct walk *walk, struct error *err)
@@ -294,33 +294,23 @@ static int describe_card(struct plan *plan, int c, const int *first, struct erro
 	card->tv_first = first[c] > halo ? first[c] - halo : 0;
 	card->tv_grid = grid_of_slices(grid, card->tv_first, tv_end - card->tv_first);
 	rows_seen(options->geometry, &card->between_grid, &card->row, &rows);
+	/* Neighbours see common rows, so that what has been seen before is in one piece. */
+	card->counted_before[0] = plan->seen[0] - card->row;
+	card->counted_before[1] = plan->seen[1] - card->row;
+	if (c == 0 || card->row < plan->seen[0])
+		plan->seen[0] = card->row;
+	if (c == 0 || card->row + rows > plan->seen[1])
+		plan->seen[1] = card->row + rows;
 	return crop(&card->geometry, options->geometry, card->row, rows, err);
-}
-
-/* Views of a subset whose projections one card has, at most. */
-static int rays_most(const struct plan *plan)
-{
-	const struct subsets *subsets = &plan->options.sart->subsets;
-	int most = 0;
-
-	for (int s = 0; s < subsets->count; s++) {
-		int on[CARDS_MOST] = {0};
-
-		for (int i = subsets->start[s]; i < subsets->start[s + 1]; i++) {
-			const int c = slot_card(plan->device, subsets->order[i]);
-
-			on[c]++;
-			most = on[c] > most ? on[c] : most;
-		}
-	}
-	return most;
 }
 
 static int plan_describe(struct plan *plan, struct device *device, const struct plan_options *options,
 			 struct error *err)
 {
 	const struct geometry *geometry = options->geometry;
-	const int nz = options->grid->size[2], half = (geometry->count + 1) / 2;
+	/* SART takes a subset in one go, if it can; all else goes by halves at least. */
+	const int nz = options->grid->size[2], all = geometry->count,
+		  count = options->sart != NULL ? all : (all + 1) / 2;
 	int first[CARDS_MOST + 1], rows = 1, code = 0;
 	size_t slot;
 
@@ -335,9 +325,11 @@ static int plan_describe(struct plan *plan, struct device *device, const struct 
 		rows = plan->card[c].geometry.rows > rows ? plan->card[c].geometry.rows : rows;
 	}
 	slot = (size_t)(geometry->columns + pad_of(plan)) * (size_t)rows * sizeof(float);
-	plan->batch = (size_t)half * slot <= BATCH_BYTES ? half : BATCH_BYTES < slot ? 1 : (int)(BATCH_BYTES / slot);
+	plan->batch = (size_t)count * slot <= BATCH_BYTES ? count : BATCH_BYTES < slot ? 1 : (int)(BATCH_BYTES / slot);
 	plan->filter_batch = has_fdk(plan) ? fdk_batch_most(geometry->count) : 0;
-	plan->rays = options->sart != NULL ? rays_most(plan) : 0;
+	/* FDK alone has no more than it filters. */
+	if (options->no_projection && has_fdk(plan) && plan->filter_batch < plan->batch)
+		plan->batch = plan->filter_batch;
 	return code;
 }
 
@@ -353,7 +345,7 @@ static void plan_clear(struct plan *plan)
 			backend->stack_free(card->wide[i]);
 		}
 		backend->stack_free(card->taken);
-		backend->stack_free(card->rays);
+		backend->stack_free(card->measured);
 		backend->volume_free(card->sums);
 		backend->volume_free(card->coverage);
 		backend->volume_free(card->smoothed);
@@ -408,10 +400,11 @@ static int allocate_lists(struct plan *plan, struct error *err)
 
 	plan->places = malloc(count * sizeof(*plan->places));
 	plan->lists = malloc(3 * count * cards * sizeof(*plan->lists));
-	plan->host = malloc(floats * sizeof(*plan->host));
+	plan->host = malloc(floats * cards * sizeof(*plan->host));
 	if (plan->places == NULL || plan->lists == NULL || plan->host == NULL)
 		return error_set(err, ERR_NO_MEMORY, "no memory for the plan of %zu cards", cards);
 	for (size_t c = 0; c < cards; c++) {
+		plan->card[c].host = plan->host + floats * c;
 		plan->card[c].from = plan->lists + 3 * count * c;
 		plan->card[c].to = plan->card[c].from + count;
 		plan->card[c].views = plan->card[c].to + count;

@@ -2,7 +2,7 @@
  * Line integrals, filtered views, forward and backprojection on several cards: cards.h. A projection is the sum of
  * those through the slabs, each between two slices of zeros, as out of core (core/outofcore/project.c).
  *
- * While a card works on a batch of views, the one before it is on its way.
+ * Cards do not wait for each other's batches but where they read them: two stacks take turns.
  */
 #include "core/cards/internal.h"
 
@@ -23,14 +23,6 @@ struct pass {
 	enum backprojection weight;
 	int first, now, half;
 };
-
-/* Views of a batch: two batches at least, so that one is worked on while the other is on its way. */
-static int batch_of(const struct plan *plan, int count)
-{
-	const int few = 8, half = (count + 1) / 2, batch = half < few ? few : half;
-
-	return batch < plan->batch ? batch : plan->batch;
-}
 
 /* The next batch; false: there is none. */
 static bool pass_next(struct pass *pass)
@@ -65,14 +57,14 @@ int slab_enter(struct plan *plan, int c, const struct volume *from, struct error
 {
 	struct card_plan *card = &plan->card[c];
 
-	return cards_pass_slices(plan->device, from, 0, card->padded, card->below, card->grid.size[2], plan->host, err);
+	return cards_pass_slices(plan->device, from, 0, card->padded, card->below, card->grid.size[2], card->host, err);
 }
 
 int slab_leave(struct plan *plan, int c, struct volume *to, struct error *err)
 {
 	struct card_plan *card = &plan->card[c];
 	int code =
-	    cards_pass_slices(plan->device, card->padded, card->below, to, 0, card->grid.size[2], plan->host, err);
+	    cards_pass_slices(plan->device, card->padded, card->below, to, 0, card->grid.size[2], card->host, err);
 
 	return code == 0 ? plan->device->backend->volume_fill(card->padded, 0, err) : code;
 }
@@ -156,6 +148,7 @@ int cards_project(struct plan *plan, const struct volume *from, const int *views
 	if (count > to->slots || count > plan->options.geometry->count)
 		return error_set(err, ERR_INTERNAL, "%d views into a stack of %d", count, to->slots);
 	place_slots(plan, count);
+	stack_written(to);
 	return project_through(plan, from, views, count, to->part, NULL, err);
 }
 
@@ -271,6 +264,7 @@ int cards_linearise(struct plan *plan, const void *samples, int count, const int
 	const size_t bytes = (size_t)to->columns * (size_t)to->rows * linearise_sample_bytes(&plan->options.linearise);
 	int code = 0;
 
+	stack_written(to);
 	for (int i = 0; i < count && code == 0; i++) {
 		int c, place;
 
@@ -378,6 +372,7 @@ int cards_filter(struct plan *plan, const struct stack *from, const int *slots, 
 		return error_set(err, ERR_INTERNAL, "the plan was made without FDK");
 	if (count > to->slots || count > plan->options.geometry->count)
 		return error_set(err, ERR_INTERNAL, "%d views into a stack of %d", count, to->slots);
+	stack_written(to);
 	code = cards_exchange(plan->device, take_views, &filtering, err);
 	return code == 0 ? crew_run(plan->device->crew, filter_views, &filtering, err) : code;
 }

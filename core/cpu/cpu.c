@@ -465,6 +465,8 @@ const struct backend backend_cpu = {
     .stack_average = cpu_stack_average,
     .sync = cpu_sync,
     .sart_correct = cpu_sart_correct,
+    .sart_sums = cpu_sart_sums,
+    .sart_squares = cpu_sart_squares,
     .sart_coverage = cpu_sart_coverage,
     .sart_update = cpu_sart_update,
 };

@@ -99,9 +99,10 @@ struct plan {
 	size_t extended[2]; /* rows that `filter` has extended on either side */
 
 	struct sart_options sart;
-	int batch;          /* views whose corrections are held at once; 0 without SART */
-	float *corrections; /* [batch][column][row], 1/mm */
-	double *ray_sums;   /* [batch][blocks of columns][2]: squares of p - A v and of p */
+	int batch;                       /* views whose corrections are held at once; 0 without SART */
+	float *corrections;              /* [batch][column][row], 1/mm */
+	double *ray_sums;                /* [batch][blocks of columns][2]: squares of p - A v and of p */
+	struct iteration_sums corrected; /* by sart_correct since the iteration began */
 	struct volume work; /* SART's numerators when a subset takes several batches; TV's f; without data: neither */
 
 	bool has_tv;
@@ -328,8 +329,11 @@ size_t tile_line(const struct plan *plan, const struct tile *tile, int line, siz
 int cpu_sart_iterate(struct plan *plan, const struct stack *projections, struct volume *volume,
 		     const struct cancel *cancel, struct iteration_sums *ret_sums, struct error *err);
 int cpu_sart_correct(struct plan *plan, const struct geometry *geometry, const struct grid *grid,
-		     const struct stack *projections, const int *slots, const int *views, int count, struct stack *rays,
-		     struct iteration_sums *ret_sums, struct error *err);
+		     const struct stack *measured, const int *views, int count, const int left_out[2], int before,
+		     struct stack *rays, struct error *err);
+int cpu_sart_sums(struct plan *plan, int count, struct iteration_sums *ret_sums, struct error *err);
+int cpu_sart_squares(struct plan *plan, const struct stack *stack, int count, const int left_out[2], double *ret_sum,
+		     struct error *err);
 int cpu_sart_coverage(struct plan *plan, const int *views, int count, struct volume *to, struct error *err);
 int cpu_sart_update(const struct sart_options *options, double least, const struct volume *sums,
 		    const struct volume *coverage, struct volume *volume, struct error *err);

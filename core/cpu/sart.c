@@ -169,39 +169,66 @@ int cpu_sart_iterate(struct plan *plan, const struct stack *projections, struct 
 /* ---- the same in parts ---- */
 
 int cpu_sart_correct(struct plan *plan, const struct geometry *geometry, const struct grid *grid,
-		     const struct stack *projections, const int *slots, const int *views, int count, struct stack *rays,
-		     struct iteration_sums *ret_sums, struct error *err)
+		     const struct stack *measured, const int *views, int count, const int left_out[2], int before,
+		     struct stack *rays, struct error *err)
 {
 	const double *mm = grid->spacing, least = RAY_LENGTH_LEAST * fmin(fmin(mm[0], mm[1]), mm[2]);
-	struct iteration_sums sums = {0};
+	struct iteration_sums *sums = &plan->corrected;
 
 	(void)err;
-	/* The columns' sums are added in their order, whichever thread made them. */
+	if (before == 0)
+		*sums = (struct iteration_sums){0};
+		/* The columns' sums are added in their order, whichever thread made them. */
 #pragma omp parallel for ordered num_threads(plan->device->threads) schedule(static, 1)
 	for (int job = 0; job < count * geometry->columns; job++) {
 		const int i = job / geometry->columns, column = job % geometry->columns;
 		const size_t at = (size_t)column * (size_t)geometry->rows;
-		const float *measured = stack_slot(projections, slots[i]) + at;
+		const float *values = stack_slot(measured, views[i]) + at;
 		float *ray = rays->data + (size_t)i * (size_t)geometry->columns * (size_t)geometry->rows + at;
 		double residual2 = 0, projection2 = 0;
 
 		for (int row = 0; row < geometry->rows; row++) {
-			const bool left_out = isnan(measured[row]);
+			const bool left = isnan(values[row]), counts = row < left_out[0] || row >= left_out[1];
 			const double length = grid_ray_length(grid, &geometry->views[views[i]], column, row);
-			const float p = left_out ? 0 : measured[row], difference = left_out ? 0 : p - ray[row];
+			const float p = left ? 0 : values[row], difference = left ? 0 : p - ray[row];
 
-			residual2 += (double)difference * difference;
-			projection2 += (double)p * p;
+			residual2 += counts ? (double)difference * difference : 0;
+			projection2 += counts ? (double)p * p : 0;
 			ray[row] = length >= least ? (float)(difference / length) : 0;
 		}
 #pragma omp ordered
 		{
-			sums.residual2 += residual2;
-			sums.projection2 += projection2;
+			sums->residual2 += residual2;
+			sums->projection2 += projection2;
 		}
 	}
 	pulse_beat();
-	*ret_sums = sums;
+	return 0;
+}
+
+int cpu_sart_sums(struct plan *plan, int count, struct iteration_sums *ret_sums, struct error *err)
+{
+	(void)count;
+	(void)err;
+	*ret_sums = plan->corrected;
+	return 0;
+}
+
+int cpu_sart_squares(struct plan *plan, const struct stack *stack, int count, const int left_out[2], double *ret_sum,
+		     struct error *err)
+{
+	double sum = 0;
+
+	(void)plan;
+	(void)err;
+	for (int i = 0; i < count * stack->columns; i++) {
+		const float *values = stack->data + (size_t)i * (size_t)stack->rows;
+
+		for (int row = 0; row < stack->rows; row++)
+			if ((row < left_out[0] || row >= left_out[1]) && !isnan(values[row]))
+				sum += (double)values[row] * values[row];
+	}
+	*ret_sum = sum;
 	return 0;
 }
 

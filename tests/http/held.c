@@ -179,11 +179,10 @@ static int iterate_or_fail(struct plan *plan, const struct stack *projections, s
 
 /* The same of one card of several. */
 static int correct_or_fail(struct plan *plan, const struct geometry *geometry, const struct grid *grid,
-			   const struct stack *projections, const int *slots, const int *views, int count,
-			   struct stack *rays, struct iteration_sums *ret_sums, struct error *err)
+			   const struct stack *measured, const int *views, int count, const int left_out[2], int before,
+			   struct stack *rays, struct error *err)
 {
-	int code =
-	    backend_cpu.sart_correct(plan, geometry, grid, projections, slots, views, count, rays, ret_sums, err);
+	int code = backend_cpu.sart_correct(plan, geometry, grid, measured, views, count, left_out, before, rays, err);
 
 	return code == 0 ? fail_iterating(plan, err) : code;
 }
