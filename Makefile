@@ -192,7 +192,7 @@ $(BUILD)/cbctd-held: $(call objects,$(daemon_sources) tests/http/held.c tests/lo
 $(BUILD)/cbctd-without-postgresql: $(filter-out $(BUILD)/daemon/store/postgresql%,$(call objects,$(daemon_sources))) $(BUILD)/proto/openapi.o $(BUILD)/web/assets.o $(library)
 	$(call say,LINK)$(CC) $(LDFLAGS) -o $@ $^ $(call pkg,--libs,$(daemon_libs) $(proto_libs) $(core_libs)) $(LIBM)
 
-gpu_programs := $(BUILD)/gpu_check $(BUILD)/gpu_bench $(BUILD)/gpu_cards
+gpu_programs := $(BUILD)/gpu_check $(BUILD)/gpu_bench $(BUILD)/gpu_cards $(BUILD)/gpu_large
 # Every program that a test or a benchmark runs, so that none stops compiling unseen.
 test-programs: $(addprefix $(BUILD)/,unit cbct-worker-held cbctd-held cbctd-without-postgresql manual faults.so clock.so every.so live_bytes.so simulated-nvml/libnvidia-ml.so.1 cpu-bench calibrate-bench agreement refine denoise presets stopping methods watchers slices acquire paper-project rabbitct $(if $(postgresql),claims)) \
                $(if $(cuda_objects),$(gpu_programs) $(BUILD)/gpu_ceilings $(BUILD)/cbct-worker-faulty,$(call objects,$(wildcard tests/bench/gpu_*.c)))
@@ -261,6 +261,13 @@ $(BUILD)/watchers $(BUILD)/slices $(BUILD)/acquire: $(BUILD)/%: $(BUILD)/tests/b
 # The GPU's checks and benchmarks need the mathematics and the kernels only, so that they run on a bare machine.
 $(gpu_programs): $(BUILD)/%: $(call objects,tests/bench/%.c tests/bench/gpu_scene.c) $(core_objects) $(cuda_objects)
 	$(call say,LINK)$(CC) $(LDFLAGS) -o $@ $^ $(call pkg,--libs,$(core_libs)) $(if $(cuda_objects),$(cuda_libs)) $(LIBM)
+
+ifdef cuda_objects
+$(BUILD)/gpu_large: $(BUILD)/tests/bench/gpu_phantom.o
+$(BUILD)/tests/bench/gpu_phantom.o: tests/bench/gpu_phantom.cu tests/bench/gpu_phantom.h kernels/internal.cuh
+	@mkdir -p $(@D)
+	$(call say,NVCC)$(NVCC) -std=c++17 -O3 -I. $(cuda_code) -c -o $@ $<
+endif
 
 $(BUILD)/gpu_ceilings: tests/bench/gpu_ceilings.cu
 	@mkdir -p $(@D)

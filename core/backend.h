@@ -40,6 +40,7 @@ struct device_options {
 	int threads;         /* CPU: 0 = all the process may use */
 	size_t memory_limit; /* bytes to use at most; 0 = what is free */
 	const char *isa;     /* CPU: "base", "avx2", "avx512"; NULL = the best that it has */
+	bool apart;          /* several cards: they pass everything through the host, as where they cannot do else */
 };
 
 struct device_info {
@@ -356,11 +357,14 @@ struct backend {
 	/* Sum of squares of slots 0 .. count - 1, but of rows left_out and of what is no number. */
 	int (*sart_squares)(struct plan *plan, const struct stack *stack, int count, const int left_out[2],
 			    double *ret_sum, struct error *err);
-	/* All views see all of the plan's grid: column sums are numbers of views. NULL: nobody looks. */
-	bool (*sart_covered)(const struct plan *plan);
+	/*
+	 * All views see all of the grid: column sums are numbers of views, of which a plan with these options takes its
+	 * own account. NULL: nobody looks.
+	 */
+	bool (*sart_covered)(const struct plan_options *options);
 	/*
 	 * The update from slots of `rays` in one go: v += relaxation * (their plain backprojection) / coverage, as
-	 * sart_update; coverage is not looked at where sart_covered. NULL: by backproject and sart_update.
+	 * sart_update; coverage NULL where sart_covered. NULL: by backproject and sart_update.
 	 */
 	int (*sart_take)(struct plan *plan, const struct sart_options *options, double least, const struct stack *rays,
 			 const int *views, int count, const struct volume *coverage, struct volume *volume,
@@ -368,9 +372,22 @@ struct backend {
 	/* Column sums: to = sum over i of w_ij of the rays of views[i], as plain `backproject` has of ones. */
 	int (*sart_coverage)(struct plan *plan, const int *views, int count, struct volume *to, struct error *err);
 	/* v += relaxation sums / coverage, where coverage is divided by as `least` if it is smaller, and not at all at
-	 * 0. */
+	 * 0; coverage NULL: 1 everywhere. */
 	int (*sart_update)(const struct sart_options *options, double least, const struct volume *sums,
 			   const struct volume *coverage, struct volume *volume, struct error *err);
+	/*
+	 * `tv` in parts: its steps first .. first + count - 1, options->iterations of them in all. Between two calls
+	 * the volume is what has been smoothed, and the plan keeps what the next steps need. TV_GENERALISED not.
+	 */
+	int (*tv_steps)(struct plan *plan, struct volume *volume, const struct tv_options *options, int first,
+			int count, const struct cancel *cancel, struct error *err);
+	/*
+	 * Between two calls, `done` steps behind the beginning: what `count` slices from z_from on have come to, to
+	 * those of another device's plan from z_to on. Called by the thread that has the device of `to`.
+	 */
+	int (*tv_pass)(struct plan *from, const struct volume *from_volume, int z_from, struct plan *to,
+		       struct volume *to_volume, int z_to, int count, const struct tv_options *options, int done,
+		       struct error *err);
 	/*
 	 * Lets these devices read each other's memory. True: stack_pass and volume_pass work between any two of them,
 	 * and the memory that they read is not overwritten before. NULL, as the next two, where that goes through the

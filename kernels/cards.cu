@@ -131,6 +131,29 @@ int cuda_volume_pass(const struct volume *from, int z_from, struct volume *to, i
 	return end_reading(other, from->used, device, to->used, err);
 }
 
+int cuda_tv_pass(struct plan *from, const struct volume *from_volume, int z_from, struct plan *to,
+		 struct volume *to_volume, int z_to, int count, const struct tv_options *options, int done,
+		 struct error *err)
+{
+	struct device *device = to->device, *other = from->device;
+	const size_t slice = (size_t)to->grid.size[0] * (size_t)to->grid.size[1];
+	struct tv_piece there[TV_PIECES], here[TV_PIECES];
+	const int pieces = tv_state(from, (struct volume *)from_volume, options, done, there);
+
+	tv_state(to, to_volume, options, done, here);
+	TRY(device_enter(device, err));
+	CUDA_TRY(cudaStreamWaitEvent(device->stream, from_volume->used, 0));
+	for (int i = 0; i < pieces; i++) {
+		const size_t bytes = slice * here[i].voxel;
+
+		CUDA_TRY(cudaMemcpyPeerAsync((char *)here[i].data + bytes * (size_t)z_to, device->index,
+					     (const char *)there[i].data + bytes * (size_t)z_from, other->index,
+					     bytes * (size_t)count, device->stream));
+	}
+	TRY(mark_used(device, to_volume->used, err));
+	return end_reading(other, from_volume->used, device, to_volume->used, err);
+}
+
 /* ---- a SART iteration in parts ---- */
 
 struct correction_job {
@@ -305,26 +328,21 @@ int cuda_sart_squares(struct plan *plan, const struct stack *stack, int count, c
 	return 0;
 }
 
-bool cuda_sart_covered(const struct plan *plan)
-{
-	return plan->shape.covered;
-}
-
 int cuda_sart_take(struct plan *plan, const struct sart_options *options, double least, const struct stack *rays,
 		   const int *views, int count, const struct volume *coverage, struct volume *volume, struct error *err)
 {
 	struct device *device = plan->device;
 	struct voxel_use use = {};
 
-	if (plan->options.together == 0 || count > plan->options.together)
-		return error_set(err, ERR_INTERNAL, "the plan was made for %d views together, not %d",
-				 plan->options.together, count);
+	if (count > plan->options.together || (coverage == NULL) != plan->shape.covered)
+		return error_set(err, ERR_INTERNAL, "the plan was made for %d views together, not %d%s",
+				 plan->options.together, count, coverage == NULL ? " without column sums" : "");
 	TRY(plan_check_views(plan, views, count, &plan->stack, rays, count, err));
 	TRY(plan_set_views(plan, views, count, err));
 	use.update = true;
 	use.nonnegative = options->nonnegative;
 	use.scale = (float)(plan->shape.covered ? options->relaxation / count : options->relaxation);
-	use.coverage = plan->shape.covered ? NULL : coverage->data;
+	use.coverage = coverage == NULL ? NULL : coverage->data;
 	use.least = (float)least;
 	TRY(backproject_views(plan, rays->data, 0, count, use, volume->data, err));
 	TRY(mark_used(device, rays->used, err));
@@ -351,7 +369,7 @@ static __global__ void __launch_bounds__(THREADS)
 
 	if (i >= count)
 		return;
-	float cover = coverage[i];
+	float cover = coverage != NULL ? coverage[i] : 1.0f;
 	if (!(cover > 0))
 		return;
 	float value = fmaf(relaxation, sums[i] / fmaxf(cover, least), volume[i]);
@@ -366,10 +384,11 @@ int cuda_sart_update(const struct sart_options *options, double least, const str
 
 	TRY(device_enter(device, err));
 	update<<<(unsigned)((count + THREADS - 1) / THREADS), THREADS, 0, device->stream>>>(
-	    sums->data, coverage->data, volume->data, count, (float)options->relaxation, (float)least,
-	    options->nonnegative);
+	    sums->data, coverage != NULL ? coverage->data : NULL, volume->data, count, (float)options->relaxation,
+	    (float)least, options->nonnegative);
 	LAUNCHED();
 	TRY(mark_used(device, sums->used, err));
-	TRY(mark_used(device, coverage->used, err));
+	if (coverage != NULL)
+		TRY(mark_used(device, coverage->used, err));
 	return mark_used(device, volume->used, err);
 }

@@ -219,13 +219,6 @@ static int sart_iterate(struct plan *plan, const struct stack *projections, stru
 	return mark_used(plan->device, volume->used, err);
 }
 
-static int tv(struct plan *plan, struct volume *volume, const struct tv_options *options, const struct cancel *cancel,
-	      struct error *err)
-{
-	TRY(cuda_tv(plan, volume, options, cancel, err));
-	return mark_used(plan->device, volume->used, err);
-}
-
 extern "C" const struct backend backend_cuda;
 const struct backend backend_cuda = {
     .name = "cuda",
@@ -260,7 +253,7 @@ const struct backend backend_cuda = {
     .backproject = backproject,
     .project = project,
     .sart_iterate = sart_iterate,
-    .tv = tv,
+    .tv = cuda_tv,
     .norms = cuda_norms,
     .volume_axpby = cuda_volume_axpby,
     .stack_axpby = cuda_stack_axpby,
@@ -281,6 +274,8 @@ const struct backend backend_cuda = {
     .sart_take = cuda_sart_take,
     .sart_coverage = cuda_sart_coverage,
     .sart_update = cuda_sart_update,
+    .tv_steps = cuda_tv_steps,
+    .tv_pass = cuda_tv_pass,
     .connect = cuda_connect,
     .stack_pass = cuda_stack_pass,
     .volume_pass = cuda_volume_pass,

@@ -563,6 +563,15 @@ size_t strategy_partials(const struct plan *plan); /* of an iteration */
 
 /* ---- tv.cu ---- */
 size_t tv_scratch_bytes(const struct plan_options *options);
+/* What steps have come to, `done` of them behind the beginning: pieces of [z][y][x], so many bytes a voxel. Returns how
+ * many. */
+enum { TV_PIECES = 5 };
+struct tv_piece {
+	void *data;
+	size_t voxel;
+};
+int tv_state(struct plan *plan, struct volume *volume, const struct tv_options *options, int done,
+	     struct tv_piece ret_pieces[TV_PIECES]);
 /* Smallest spacing / spacing along the axis; and the sum of their squares over the axes that have differences. */
 double tv_weight(const struct plan *plan, int axis);
 double tv_squared_weights(const struct plan *plan);
@@ -591,7 +600,7 @@ int cuda_sart_correct(struct plan *plan, const struct geometry *geometry, const 
 int cuda_sart_sums(struct plan *plan, int count, struct iteration_sums *ret_sums, struct error *err);
 int cuda_sart_squares(struct plan *plan, const struct stack *stack, int count, const int left_out[2], double *ret_sum,
 		      struct error *err);
-bool cuda_sart_covered(const struct plan *plan);
+bool cuda_sart_covered(const struct plan_options *options);
 int cuda_sart_take(struct plan *plan, const struct sart_options *options, double least, const struct stack *rays,
 		   const int *views, int count, const struct volume *coverage, struct volume *volume,
 		   struct error *err);
@@ -604,6 +613,11 @@ int cuda_stack_pass(const struct stack *from, const int *from_slots, int from_ro
 int cuda_volume_pass(const struct volume *from, int z_from, struct volume *to, int z_to, int count, struct error *err);
 int cuda_tv(struct plan *plan, struct volume *volume, const struct tv_options *options, const struct cancel *cancel,
 	    struct error *err);
+int cuda_tv_steps(struct plan *plan, struct volume *volume, const struct tv_options *options, int first, int count,
+		  const struct cancel *cancel, struct error *err);
+int cuda_tv_pass(struct plan *from, const struct volume *from_volume, int z_from, struct plan *to,
+		 struct volume *to_volume, int z_to, int count, const struct tv_options *options, int done,
+		 struct error *err);
 int cuda_norms(struct plan *plan, const struct volume *volume, const struct volume *other, double unit,
 	       struct volume_norms *ret_norms, struct error *err);
 int cuda_volume_axpby(double a, const struct volume *x, double b, struct volume *y, struct error *err);

@@ -69,6 +69,11 @@ static bool is_covered(const struct geometry *geometry, const struct grid *grid)
 	return true;
 }
 
+bool cuda_sart_covered(const struct plan_options *options)
+{
+	return !options->matched && is_covered(options->geometry, options->grid);
+}
+
 /*
  * Some ray runs closer to z than to x and y. A raster of pixels is looked at; the
  * margin covers the rays in between, as long as a view is less than 60 degrees wide.
@@ -369,7 +374,7 @@ static struct plan_shape shape_of(const struct plan_options *options, enum thrif
 			  (long)shape.view_warps * shape.subset < WARPS_ENOUGH;
 	shape.copied = shape.indexed && shape.halves && shape.forward_rows > 0 && !shape.rows_apart &&
 		       geometry->columns <= SIDE_MOST && geometry->rows <= SIDE_MOST;
-	shape.covered = !options->matched && is_covered(geometry, grid);
+	shape.covered = cuda_sart_covered(options);
 	shape.views_at_once = at_most(geometry->count, lean_or(thrift, VIEWS_AT_ONCE));
 	if (options->column_weights != NULL) {
 		shape.plain = filter_choose(wide_columns(options));

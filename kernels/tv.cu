@@ -388,18 +388,24 @@ size_t tv_scratch_bytes(const struct plan_options *options)
 	return options->reference_precision ? 5 * volume : 6 * volume;
 }
 
+/* Steps that are taken, of tv_options.iterations. */
+struct tv_part {
+	int first, count;
+};
+
 /* The smallest epsilon with which the steps are stable: see core/cpu/tv.c. */
-static int run_gradient(struct plan *plan, float *volume, const struct tv_options *tv, const struct cancel *cancel,
-			struct error *err)
+static int run_gradient(struct plan *plan, float *volume, const struct tv_options *tv, tv_part part,
+			const struct cancel *cancel, struct error *err)
 {
 	size_t voxels = grid_voxels(plan->options.grid);
 	tv_step s = step_make(plan, 1, tv->step * tv->unit, tv->step * tv->alpha);
 	double damping = fmax(2 - tv->alpha * tv->step, .1);
 	double epsilon = 4 * tv_squared_weights(plan) * tv->step / damping * tv->unit;
-	float *from = volume, *work[2] = {plan->scratch, plan->scratch + voxels};
+	float *work[2] = {plan->scratch, plan->scratch + voxels};
+	float *from = part.first > 0 ? work[(part.first - 1) % 2] : volume;
 
 	s.epsilon2 = fmaxf((float)(epsilon * epsilon), 1e-30f); /* a single voxel has no differences: 0, not 0/0 */
-	for (int i = 0; i < tv->iterations; i++) {
+	for (int i = part.first; i < part.first + part.count; i++) {
 		/* The volume is f until the last step writes over it, each voxel behind its own reading. */
 		float *to = i > 0 && i == tv->iterations - 1 ? volume : work[i % 2];
 
@@ -408,7 +414,7 @@ static int run_gradient(struct plan *plan, float *volume, const struct tv_option
 		LAUNCHED();
 		from = to;
 	}
-	if (from != volume)
+	if (from != volume && part.first + part.count == tv->iterations)
 		CUDA_TRY(cudaMemcpyAsync(volume, from, voxels * sizeof(float), cudaMemcpyDeviceToDevice,
 					 plan->device->stream));
 	return 0;
@@ -430,6 +436,14 @@ static pace pace_next(const struct tv_options *tv, pace p)
 
 	return {p.tau * theta, p.sigma / theta, theta};
 }
+static pace pace_at(const struct plan *plan, const struct tv_options *tv, int step)
+{
+	pace p = pace_first(plan, tv);
+
+	for (int i = 0; i < step; i++)
+		p = pace_next(tv, p);
+	return p;
+}
 static tv_step step_at(const struct plan *plan, const struct tv_options *tv, pace p)
 {
 	double damping = 1 + p.tau * tv->alpha;
@@ -439,26 +453,44 @@ static tv_step step_at(const struct plan *plan, const struct tv_options *tv, pac
 	return s;
 }
 
-static int run_proximal(struct plan *plan, float *volume, const struct tv_options *tv, const struct cancel *cancel,
-			struct error *err)
+/* Where the primal-dual steps keep what they have after `done` of them. */
+struct proximal_state {
+	float *v, *past;
+	__half *dual[3];
+};
+
+static proximal_state proximal_at(struct plan *plan, float *volume, int done)
+{
+	size_t voxels = grid_voxels(plan->options.grid);
+	__half *dual = (__half *)(plan->scratch + 3 * voxels) + (size_t)(done % 2) * 3 * voxels;
+	proximal_state state = {volume, volume, {dual, dual + voxels, dual + 2 * voxels}};
+
+	if (done > 0)
+		state.v = plan->scratch + (size_t)((done - 1) % 3) * voxels;
+	if (done > 1)
+		state.past = plan->scratch + (size_t)((done - 2) % 3) * voxels;
+	return state;
+}
+
+static int run_proximal(struct plan *plan, float *volume, const struct tv_options *tv, tv_part part,
+			const struct cancel *cancel, struct error *err)
 {
 	size_t voxels = grid_voxels(plan->options.grid);
 	int iterations = tv->iterations;
-	float *from = volume, *past = volume;
-	float *work[3] = {plan->scratch, plan->scratch + voxels, plan->scratch + 2 * voxels};
-	__half *dual[2] = {(__half *)(plan->scratch + 3 * voxels), (__half *)(plan->scratch + 3 * voxels) + 3 * voxels};
-	pace pace = pace_first(plan, tv);
+	float *from = volume;
+	pace pace = pace_at(plan, tv, part.first);
 
-	for (int i = 0; i < iterations; i++, pace = pace_next(tv, pace)) {
+	for (int i = part.first; i < part.first + part.count; i++, pace = pace_next(tv, pace)) {
+		proximal_state now = proximal_at(plan, volume, i), next = proximal_at(plan, volume, i + 1);
 		bool last = i == iterations - 1;
 		/* The volume is f, and up to the second step v or past. */
-		float *to = last && i > 1 ? volume : work[i % 3];
-		tv_volumes volumes = {volume, from, past, to, {}, {}};
+		float *to = last && i > 1 ? volume : next.v;
+		tv_volumes volumes = {volume, now.v, now.past, to, {}, {}};
 		tv_step s = step_at(plan, tv, pace);
 
 		for (int k = 0; k < 3; k++) {
-			volumes.dual[k] = dual[i % 2] + k * voxels;
-			volumes.ret_dual[k] = dual[1 - i % 2] + k * voxels;
+			volumes.dual[k] = now.dual[k];
+			volumes.ret_dual[k] = next.dual[k];
 		}
 		TRY(cancel_check(cancel, err));
 		if (i == 0)
@@ -468,10 +500,9 @@ static int run_proximal(struct plan *plan, float *volume, const struct tv_option
 		else
 			launch<STEP_MIDDLE>(plan->device, volumes, s);
 		LAUNCHED();
-		past = from;
 		from = to;
 	}
-	if (from != volume)
+	if (from != volume && part.first + part.count == iterations)
 		CUDA_TRY(cudaMemcpyAsync(volume, from, voxels * sizeof(float), cudaMemcpyDeviceToDevice,
 					 plan->device->stream));
 	return 0;
@@ -520,7 +551,7 @@ static __global__ void step_primal(const tv_step s, const float *f, const float 
 }
 
 /* Two kernels a step, each in place: half the memory, and 56 bytes a voxel. */
-static int run_proximal_in_float(struct plan *plan, float *volume, const struct tv_options *tv,
+static int run_proximal_in_float(struct plan *plan, float *volume, const struct tv_options *tv, tv_part part,
 				 const struct cancel *cancel, struct error *err)
 {
 	size_t voxels = grid_voxels(plan->options.grid);
@@ -530,9 +561,9 @@ static int run_proximal_in_float(struct plan *plan, float *volume, const struct 
 	float3 *p = (float3 *)(plan->scratch + 2 * voxels);
 	dim3 threads(32, 8), blocks(divide_up(size[0], 32), divide_up(size[1], 8), size[2]);
 	cudaStream_t stream = plan->device->stream;
-	pace pace = pace_first(plan, tv);
+	pace pace = pace_at(plan, tv, part.first);
 
-	for (int i = 0; i < iterations; i++) {
+	for (int i = part.first; i < part.first + part.count; i++) {
 		tv_step s = step_at(plan, tv, pace);
 		bool first = i == 0, last = i == iterations - 1;
 
@@ -548,17 +579,52 @@ static int run_proximal_in_float(struct plan *plan, float *volume, const struct 
 	return 0;
 }
 
-int cuda_tv(struct plan *plan, struct volume *volume, const struct tv_options *options, const struct cancel *cancel,
-	    struct error *err)
+int cuda_tv_steps(struct plan *plan, struct volume *volume, const struct tv_options *options, int first, int count,
+		  const struct cancel *cancel, struct error *err)
 {
+	tv_part part = {first, count};
+
 	if (plan->options.tv == NULL || options->method > plan->options.tv->method)
 		return error_set(err, ERR_INTERNAL, "the plan was made without this TV");
 	TRY(device_enter(plan->device, err));
 	plan_end_slices(plan);
 	if (options->method == TV_GRADIENT)
-		return run_gradient(plan, volume->data, options, cancel, err);
-	if (options->method == TV_GENERALISED)
-		return tgv_run(plan, volume->data, options, cancel, err);
-	return plan->options.reference_precision ? run_proximal_in_float(plan, volume->data, options, cancel, err)
-						 : run_proximal(plan, volume->data, options, cancel, err);
+		TRY(run_gradient(plan, volume->data, options, part, cancel, err));
+	else if (options->method == TV_GENERALISED)
+		TRY(tgv_run(plan, volume->data, options, cancel, err));
+	else if (plan->options.reference_precision)
+		TRY(run_proximal_in_float(plan, volume->data, options, part, cancel, err));
+	else
+		TRY(run_proximal(plan, volume->data, options, part, cancel, err));
+	return mark_used(plan->device, volume->used, err);
+}
+
+int cuda_tv(struct plan *plan, struct volume *volume, const struct tv_options *options, const struct cancel *cancel,
+	    struct error *err)
+{
+	return cuda_tv_steps(plan, volume, options, 0, options->iterations, cancel, err);
+}
+
+int tv_state(struct plan *plan, struct volume *volume, const struct tv_options *options, int done,
+	     struct tv_piece ret_pieces[TV_PIECES])
+{
+	size_t voxels = grid_voxels(plan->options.grid);
+
+	if (options->method == TV_GRADIENT) {
+		ret_pieces[0] = {done > 0 ? plan->scratch + (size_t)((done - 1) % 2) * voxels : volume->data,
+				 sizeof(float)};
+		return 1;
+	}
+	if (plan->options.reference_precision) {
+		ret_pieces[0] = {plan->scratch, sizeof(float)};
+		ret_pieces[1] = {plan->scratch + voxels, sizeof(float)};
+		ret_pieces[2] = {plan->scratch + 2 * voxels, sizeof(float3)};
+		return 3;
+	}
+	proximal_state state = proximal_at(plan, volume->data, done);
+	ret_pieces[0] = {state.v, sizeof(float)};
+	ret_pieces[1] = {state.past, sizeof(float)};
+	for (int k = 0; k < 3; k++)
+		ret_pieces[2 + k] = {state.dual[k], sizeof(__half)};
+	return 5;
 }

@@ -58,7 +58,7 @@ static int open_cards(struct device *device, const int *indices, int count, cons
 				return error_set(err, ERR_INVALID, "card %d is named twice", index);
 		code = backend->open(index, &share, &device->card[device->count], err);
 	}
-	if (code == 0)
+	if (code == 0 && !options->apart)
 		device->connected = backend->connect != NULL && backend->connect(device->card, count);
 	return code == 0 ? crew_new(count, &device->crew, err) : code;
 }

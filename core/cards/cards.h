@@ -9,9 +9,9 @@
  *
  * Volumes are cut into slabs of slices, one a card; projections are dealt out, each whole on one card. A card projects
  * all views through its slab, between slices of zeros, onto the rows that see it, and these partial rays are added up
- * in the order of the cards where the view lies; the other way, a view's rows go to each card whose slab they see. So
- * what is exchanged is of the projections' size, whatever the number of subsets, and a card holds its share of
- * everything. TV takes as many slices of the neighbours as it has steps.
+ * in the order of the cards where the view lies; the other way, a view's rows go to each card whose slab they see. In
+ * SART each card has its rows of the measured projections, too, and only rays through two slabs are exchanged. A card
+ * holds its share of all else. TV takes some slices of the neighbours, anew every few steps.
  *
  * The same number of cards gives the same bits; another number differs by rounding, for linear interpolation is linear
  * and sums are added in another order.

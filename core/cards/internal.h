@@ -97,6 +97,7 @@ struct card_plan {
 	/* SART: these rows of all measured projections, and which of them other cards have that come before. */
 	struct stack *measured;
 	int counted_before[2];
+	bool covered; /* every view sees all of the slab: there are no column sums */
 	struct volume *sums, *coverage;
 	int *from, *to, *views; /* [count], lists */
 	float *host;            /* where nothing is connected: two views, or two slices */
@@ -107,6 +108,7 @@ struct plan {
 	struct plan_options options;
 	struct grid one;
 	int parts;                 /* cards that have a slab */
+	int tv_steps;              /* of TV between two exchanges, and slices of the neighbours for it */
 	int batch;                 /* views that a card projects or backprojects in one go */
 	int filter_batch, covered; /* slots of taken; subset whose column sums are there, -1: none */
 	int seen[2];               /* rows that any slab is seen by: from and to */
@@ -157,10 +159,12 @@ static inline bool goes_between(const struct plan *plan, enum backprojection wei
 {
 	return plan->options.matched && weight == BACKPROJECT_PLAIN;
 }
-/* Views of a batch, of so many. */
+/* Views of a batch, of so many: as few batches as can be, alike. */
 static inline int batch_of(const struct plan *plan, int count)
 {
-	return count < plan->batch ? count : plan->batch;
+	const int batches = (count + plan->batch - 1) / plan->batch;
+
+	return batches == 0 ? 0 : (count + batches - 1) / batches;
 }
 /* The slab from and to its place between slices of zeros; the second leaves zeros there. */
 int slab_enter(struct plan *plan, int c, const struct volume *from, struct error *err);

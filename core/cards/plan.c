@@ -208,6 +208,7 @@ static int walk_slab(struct plan *plan, int c, struct walk *walk, struct error *
 		memcpy(options.pad, all->pad, sizeof(options.pad));
 	}
 	options.together = all->sart != NULL ? batch_of(plan, subsets_largest(&all->sart->subsets)) : 0;
+	options.no_projection = true; /* `between` projects */
 	code = walk_plan(walk, &options, &card->slab, err);
 	if (code == 0 && (!all->no_projection || all->matched)) {
 		options = plain_options(plan, &card->geometry, &card->between_grid, 2 * plan->batch);
@@ -225,7 +226,8 @@ static int walk_slab(struct plan *plan, int c, struct walk *walk, struct error *
 	}
 	if (code == 0 && all->sart != NULL)
 		code = walk_volume(walk, &card->grid, &card->sums, err);
-	return code == 0 && all->sart != NULL ? walk_volume(walk, &card->grid, &card->coverage, err) : code;
+	return code == 0 && all->sart != NULL && !card->covered ? walk_volume(walk, &card->grid, &card->coverage, err)
+								: code;
 }
 
 static int walk_stacks(struct plan *plan, int c, struct walk *walk, struct error *err)
@@ -277,14 +279,30 @@ static int bytes_beside(struct plan *plan, int c, size_t *ret_bytes, struct erro
 
 /* ---- the plan ---- */
 
+/*
+ * Steps of TV from exchange to exchange. Each costs a slice more on either side; by eight, slabs of 128 slices work on
+ * an eighth more, and what is passed takes little beside them. Where state cannot be passed they are all steps.
+ */
+static int tv_steps_of(const struct device *device, const struct tv_options *tv)
+{
+	const int most = 8;
+
+	if (tv == NULL)
+		return 0;
+	if (tv->method == TV_GENERALISED || device->backend->tv_pass == NULL)
+		return tv->iterations;
+	return tv->iterations < most ? tv->iterations : most;
+}
+
 static int describe_card(struct plan *plan, int c, const int *first, struct error *err)
 {
 	const struct plan_options *options = &plan->options;
 	const struct grid *grid = options->grid;
 	struct card_plan *card = &plan->card[c];
-	const int nz = grid->size[2], halo = options->tv != NULL ? options->tv->iterations : 0;
+	const int nz = grid->size[2], halo = plan->tv_steps;
 	const int end = first[c + 1], above = end < nz, tv_end = end + halo < nz ? end + halo : nz;
-	int rows;
+	struct plan_options slab;
+	int rows, code;
 
 	if (c >= plan->parts)
 		return 0;
@@ -301,7 +319,12 @@ static int describe_card(struct plan *plan, int c, const int *first, struct erro
 		plan->seen[0] = card->row;
 	if (c == 0 || card->row + rows > plan->seen[1])
 		plan->seen[1] = card->row + rows;
-	return crop(&card->geometry, options->geometry, card->row, rows, err);
+	code = crop(&card->geometry, options->geometry, card->row, rows, err);
+	if (code < 0 || options->sart == NULL || plan->device->backend->sart_covered == NULL)
+		return code;
+	slab = plain_options(plan, &card->geometry, &card->grid, 1);
+	card->covered = plan->device->backend->sart_covered(&slab);
+	return 0;
 }
 
 static int plan_describe(struct plan *plan, struct device *device, const struct plan_options *options,
@@ -317,6 +340,7 @@ static int plan_describe(struct plan *plan, struct device *device, const struct 
 	plan->device = device;
 	plan->options = *options;
 	plan->covered = -1;
+	plan->tv_steps = tv_steps_of(device, options->tv);
 	plan->one = one_voxel(options->grid);
 	plan->parts = nz < device->count ? nz : device->count;
 	slabs_cut(device, nz, first);

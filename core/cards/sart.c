@@ -206,6 +206,7 @@ static int take_views(void *context, int c, struct error *err)
 	const struct backend *backend = below(update);
 	struct volume *volume = update->volume->part[c];
 	const bool last = update->first + update->now == update->count, at_once = goes_at_once(update);
+	struct sart_options options = *plan->options.sart;
 	int code;
 
 	if (c >= plan->parts)
@@ -217,16 +218,16 @@ static int take_views(void *context, int c, struct error *err)
 		code = add_sums(update, c, err);
 	if (code < 0 || !last)
 		return code;
-	if (at_once && backend->sart_covered != NULL && backend->sart_covered(card->slab))
-		return backend->sart_take(card->slab, plan->options.sart, 0, card->in[1], update->views, update->count,
-					  NULL, volume, err);
-	code = cover_slab(update, c, err);
+	if (!card->covered)
+		code = cover_slab(update, c, err);
 	if (code < 0)
 		return code;
-	return at_once
-		   ? backend->sart_take(card->slab, plan->options.sart, least_of(plan), card->in[1], update->views,
-					update->count, card->coverage, volume, err)
-		   : backend->sart_update(plan->options.sart, least_of(plan), card->sums, card->coverage, volume, err);
+	if (at_once)
+		return backend->sart_take(card->slab, plan->options.sart, least_of(plan), card->in[1], update->views,
+					  update->count, card->coverage, volume, err);
+	if (card->covered)
+		options.relaxation /= update->count;
+	return backend->sart_update(&options, least_of(plan), card->sums, card->coverage, volume, err);
 }
 
 static int join_and_take_views(void *context, int c, struct error *err)

@@ -1,6 +1,7 @@
 /*
- * TV and norms on several cards. A step of TV reaches one voxel, so a slab with as many slices on either side as there
- * are steps comes out as it would within the whole.
+ * TV and norms on several cards. A step of TV reaches one voxel, so a slab with some slices on either side comes out as
+ * it would within the whole after as many steps. Then these slices are taken anew from the cards that have them, with
+ * all that the method knows of them, so that the whole has the bits of one card.
  */
 #include <math.h>
 #include <stdatomic.h>
@@ -14,6 +15,7 @@ struct smoothing {
 	const struct tv_options *options;
 	const struct cancel *cancel;
 	atomic_bool cancelled;
+	int done, now; /* steps, and those in hand */
 };
 
 static bool ask(void *context)
@@ -56,11 +58,38 @@ static int smooth(void *context, int c, struct error *err)
 {
 	struct smoothing *smoothing = context;
 	const struct plan *plan = smoothing->plan;
+	const struct backend *backend = plan->device->backend;
+	const struct card_plan *card = &plan->card[c];
 	const struct cancel cancel = {.asked = c == 0 ? ask : hear, .context = smoothing};
 
-	return c >= plan->parts ? 0
-				: plan->device->backend->tv(plan->card[c].tv, plan->card[c].smoothed,
-							    smoothing->options, &cancel, err);
+	if (c >= plan->parts)
+		return 0;
+	if (smoothing->now == smoothing->options->iterations)
+		return backend->tv(card->tv, card->smoothed, smoothing->options, &cancel, err);
+	return backend->tv_steps(card->tv, card->smoothed, smoothing->options, smoothing->done, smoothing->now, &cancel,
+				 err);
+}
+
+/* Takes the slices beside the slab again, as they have become where they belong. */
+static int take_steps(void *context, int c, struct error *err)
+{
+	const struct smoothing *smoothing = context;
+	const struct plan *plan = smoothing->plan;
+	const struct card_plan *card = &plan->card[c];
+	const int *first = smoothing->volume->first, end = card->tv_first + card->tv_grid.size[2];
+	int code = 0;
+
+	for (int s = 0; s < plan->parts && c < plan->parts && code == 0; s++) {
+		const struct card_plan *other = &plan->card[s];
+		const int low = first[s] > card->tv_first ? first[s] : card->tv_first;
+		const int high = first[s + 1] < end ? first[s + 1] : end;
+
+		if (s != c && low < high)
+			code = plan->device->backend->tv_pass(other->tv, other->smoothed, low - other->tv_first,
+							      card->tv, card->smoothed, low - card->tv_first,
+							      high - low, smoothing->options, smoothing->done, err);
+	}
+	return code;
 }
 
 static int put_slab(void *context, int c, struct error *err)
@@ -85,8 +114,15 @@ int cards_tv(struct plan *plan, struct volume *volume, const struct tv_options *
 	if (plan->options.tv == NULL || options->iterations > plan->options.tv->iterations)
 		return error_set(err, ERR_INTERNAL, "the plan was made without this TV");
 	code = cards_exchange(device, take_slices, &smoothing, err);
-	if (code == 0)
+	while (code == 0 && smoothing.done < options->iterations) {
+		const int left = options->iterations - smoothing.done;
+
+		smoothing.now = left < plan->tv_steps ? left : plan->tv_steps;
 		code = crew_run(device->crew, smooth, &smoothing, err);
+		smoothing.done += smoothing.now;
+		if (code == 0 && smoothing.done < options->iterations)
+			code = cards_exchange(device, take_steps, &smoothing, err);
+	}
 	return code == 0 ? cards_exchange(device, put_slab, &smoothing, err) : code;
 }
 

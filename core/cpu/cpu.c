@@ -467,6 +467,8 @@ const struct backend backend_cpu = {
     .sart_correct = cpu_sart_correct,
     .sart_sums = cpu_sart_sums,
     .sart_squares = cpu_sart_squares,
+    .tv_steps = cpu_tv_steps,
+    .tv_pass = cpu_tv_pass,
     .sart_coverage = cpu_sart_coverage,
     .sart_update = cpu_sart_update,
 };

@@ -343,6 +343,11 @@ void tv_box_of(const struct plan *plan, struct tv_box *ret_box);
 /* Sum of the squared weights of the axes that have differences; |grad|^2 <= 4 times that. */
 double tv_box_weights(const struct tv_box *box);
 size_t tv_planes_floats(const struct plan *plan);
+int cpu_tv_steps(struct plan *plan, struct volume *volume, const struct tv_options *options, int first, int count,
+		 const struct cancel *cancel, struct error *err);
+int cpu_tv_pass(struct plan *from, const struct volume *from_volume, int z_from, struct plan *to,
+		struct volume *to_volume, int z_to, int count, const struct tv_options *options, int done,
+		struct error *err);
 int cpu_tv(struct plan *plan, struct volume *volume, const struct tv_options *options, const struct cancel *cancel,
 	   struct error *err);
 

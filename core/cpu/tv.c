@@ -89,6 +89,7 @@ struct pass {
 	const float *f;
 	float *dual[3]; /* flux along slow, middle, fast; NULL for explicit steps */
 	struct tv_step step;
+	int first, count; /* steps that are taken */
 };
 
 /* Flux of one row. `next` is the plane behind, NULL at the last: then differences to the row itself, 0, are taken. */
@@ -200,7 +201,7 @@ static int run_gradient(const struct plan *plan, struct pass *pass, const struct
 	    .fidelity = (float)(tv->step * tv->alpha),
 	    .epsilon2 = (float)(epsilon * epsilon),
 	};
-	for (int i = 0; i < tv->iterations; i++) {
+	for (int i = 0; i < pass->count; i++) {
 		int code = cancel_check(cancel, err);
 
 		if (code < 0)
@@ -225,9 +226,9 @@ static int run_proximal(const struct plan *plan, struct pass *pass, const struct
 	const double square = fmax(4 * tv_box_weights(pass->box), 1);
 	double tau = TAU_FIRST / tv->alpha, sigma = 1 / (square * tau);
 
-	for (int i = 0; i < tv->iterations; i++) {
+	for (int i = 0; i < pass->first + pass->count; i++) {
 		const double theta = 1 / sqrt(1 + 2 * tv->alpha * tau);
-		int code = cancel_check(cancel, err);
+		int code = i < pass->first ? 0 : cancel_check(cancel, err);
 
 		if (code < 0)
 			return code;
@@ -237,38 +238,86 @@ static int run_proximal(const struct plan *plan, struct pass *pass, const struct
 		    .sigma = (float)(sigma / tv->unit),
 		    .theta = (float)theta,
 		};
-		run_pass(plan, pass);
+		if (i >= pass->first)
+			run_pass(plan, pass);
 		tau *= theta;
 		sigma /= theta;
 	}
 	return 0;
 }
 
-int cpu_tv(struct plan *plan, struct volume *volume, const struct tv_options *options, const struct cancel *cancel,
-	   struct error *err)
+/* f, and where the primal-dual steps begin. */
+static int begin(struct plan *plan, const struct volume *volume, enum tv_method method, struct error *err)
+{
+	int code = backend_cpu.volume_copy(&plan->work, volume, err);
+
+	if (code == 0 && method != TV_GRADIENT)
+		code = backend_cpu.volume_copy(&plan->ahead, volume, err);
+	for (int i = 0; code == 0 && method == TV_PROXIMAL && i < 3; i++)
+		code = backend_cpu.volume_fill(&plan->dual[i], 0, err);
+	return code;
+}
+
+int cpu_tv_steps(struct plan *plan, struct volume *volume, const struct tv_options *options, int first, int count,
+		 const struct cancel *cancel, struct error *err)
 {
 	struct tv_box box;
 	struct pass pass = {.box = &box, .kernels = plan->device->kernels, .v = volume->data};
-	int code;
+	int code = 0;
 
 	if (!plan->has_tv || options->method > plan->tv.method)
 		return error_set(err, ERR_INTERNAL, "the plan was made without this TV");
 	tv_box_of(plan, &box);
-	code = backend_cpu.volume_copy(&plan->work, volume, err);
+	if (first == 0)
+		code = begin(plan, volume, options->method, err);
 	if (code < 0)
 		return code;
 	pass.f = plan->work.data;
+	pass.first = first;
+	pass.count = count;
 	if (options->method == TV_GRADIENT) {
 		pass.ahead = pass.v;
 		return run_gradient(plan, &pass, options, cancel, err);
 	}
 	pass.ahead = plan->ahead.data;
-	code = backend_cpu.volume_copy(&plan->ahead, volume, err);
-	if (code == 0 && options->method == TV_GENERALISED)
-		return tgv_run(plan, volume, options, cancel, err);
-	for (int i = 0; code == 0 && i < 3; i++) {
+	for (int i = 0; i < 3; i++)
 		pass.dual[i] = plan->dual[i].data;
-		code = backend_cpu.volume_fill(&plan->dual[i], 0, err);
-	}
-	return code < 0 ? code : run_proximal(plan, &pass, options, cancel, err);
+	return run_proximal(plan, &pass, options, cancel, err);
+}
+
+int cpu_tv(struct plan *plan, struct volume *volume, const struct tv_options *options, const struct cancel *cancel,
+	   struct error *err)
+{
+	int code;
+
+	if (options->method != TV_GENERALISED)
+		return cpu_tv_steps(plan, volume, options, 0, options->iterations, cancel, err);
+	if (!plan->has_tv || options->method > plan->tv.method)
+		return error_set(err, ERR_INTERNAL, "the plan was made without this TV");
+	code = begin(plan, volume, options->method, err);
+	return code < 0 ? code : tgv_run(plan, volume, options, cancel, err);
+}
+
+static void pass_slices(const struct volume *from, int z_from, struct volume *to, int z_to, int count)
+{
+	for (int y = 0; y < to->size[1]; y++)
+		for (int x = 0; x < to->size[0]; x++)
+			memcpy(to->data + (size_t)y * to->plane + (size_t)x * to->row + z_to,
+			       from->data + (size_t)y * from->plane + (size_t)x * from->row + z_from,
+			       (size_t)count * sizeof(float));
+}
+
+int cpu_tv_pass(struct plan *from, const struct volume *from_volume, int z_from, struct plan *to,
+		struct volume *to_volume, int z_to, int count, const struct tv_options *options, int done,
+		struct error *err)
+{
+	(void)done;
+	(void)err;
+	pass_slices(from_volume, z_from, to_volume, z_to, count);
+	if (options->method == TV_GRADIENT)
+		return 0;
+	pass_slices(&from->ahead, z_from, &to->ahead, z_to, count);
+	for (int i = 0; i < 3; i++)
+		pass_slices(&from->dual[i], z_from, &to->dual[i], z_to, count);
+	return 0;
 }

@@ -2,8 +2,9 @@
  * Several cards in one job beside one of them (core/cards/cards.h): results first, on small scenes of every kind, then
  * times of cases D and E as in gpu_bench.c. Prints one line each; ends with 1 if a result is off.
  *
- *   gpu_cards [--brief] [CARDS ...]     default: 2 and 4, as far as they are there; --brief, for compute-sanitizer:
- *                                       results of three bends, and no times
+ *   gpu_cards [--brief] [--apart] [CARDS ...]   default: 2 and 4, as far as they are there; --brief, for
+ *                                       compute-sanitizer: results of three bends, and no times; --apart: the cards
+ *                                       pass everything through the host
  */
 #include <math.h>
 #include <stdio.h>
@@ -30,11 +31,12 @@ struct bench {
 };
 
 static int failures;
+static bool apart;
 
 static void open_cards(struct bench *bench, int cards)
 {
 	const int indices[CARDS_MOST] = {0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15};
-	const struct device_options options = {0};
+	const struct device_options options = {.apart = apart};
 	struct error err = {0};
 
 	if (cards == 1) {
@@ -156,29 +158,44 @@ static void run_backproject(struct bench *bench)
 }
 
 static const struct tv_options tv_options = {
-    .method = TV_PROXIMAL, .alpha = .1, .step = .1, .iterations = 8, .unit = 1};
+    .method = TV_PROXIMAL, .alpha = .1, .step = .1, .iterations = 100, .unit = 1};
 
-static void run_tv(struct bench *bench)
+static const struct tv_options gradient_options = {
+    .method = TV_GRADIENT, .alpha = .1, .step = .1, .iterations = 20, .unit = 1};
+
+static void smooth(struct bench *bench, const struct tv_options *options)
 {
 	struct error err = {0};
 
 	must(bench->backend->volume_copy(bench->volume, bench->start, &err), &err, "copy");
-	must(bench->backend->tv(bench->plan, bench->volume, &tv_options, NULL, &err), &err, "tv");
+	must(bench->backend->tv(bench->plan, bench->volume, options, NULL, &err), &err, "tv");
+}
+
+static void run_tv(struct bench *bench)
+{
+	smooth(bench, &tv_options);
+}
+
+static void run_gradient(struct bench *bench)
+{
+	smooth(bench, &gradient_options);
 }
 
 static const struct {
 	const char *what;
 	int subsets;
-	bool matched, tv, small_only;
+	bool matched, small_only;
+	const struct tv_options *tv;
 	void (*run)(struct bench *bench);
 } rows[] = {
-    {"forward projection", 0, false, false, false, run_project},
-    {"plain backprojection", 0, false, false, false, run_backproject},
-    {"FDK", 0, false, false, false, run_fdk},
-    {"SIRT iteration", 1, false, false, false, run_sart},
-    {"OS-SART iteration, 10", 10, false, false, false, run_sart},
-    {"matched SIRT iteration", 1, true, false, true, run_sart},
-    {"proximal TV, 8 steps", 0, false, true, true, run_tv},
+    {"forward projection", 0, false, false, NULL, run_project},
+    {"plain backprojection", 0, false, false, NULL, run_backproject},
+    {"FDK", 0, false, false, NULL, run_fdk},
+    {"SIRT iteration", 1, false, false, NULL, run_sart},
+    {"OS-SART iteration, 10", 10, false, false, NULL, run_sart},
+    {"matched SIRT iteration", 1, true, true, NULL, run_sart},
+    {"proximal TV, 100 steps", 0, false, true, &tv_options, run_tv},
+    {"explicit TV, 20 steps", 0, false, true, &gradient_options, run_gradient},
 };
 enum { ROWS = sizeof(rows) / sizeof(rows[0]) };
 
@@ -188,7 +205,7 @@ static void begin_row(struct bench *bench, int row)
 
 	end_plan(bench);
 	must(bench->backend->volume_fill(bench->volume, 0, &err), &err, "fill");
-	begin_plan(bench, rows[row].subsets, rows[row].matched, rows[row].tv ? &tv_options : NULL);
+	begin_plan(bench, rows[row].subsets, rows[row].matched, rows[row].tv);
 }
 
 /* ---- results ---- */
@@ -347,7 +364,8 @@ int main(int argc, char **argv)
 	const bool brief = argc > 1 && strcmp(argv[1], "--brief") == 0;
 	int cards[CARDS_MOST], count = 0;
 
-	for (int i = 1 + brief; i < argc && count < CARDS_MOST; i++)
+	apart = argc > 1 + brief && strcmp(argv[1 + brief], "--apart") == 0;
+	for (int i = 1 + brief + apart; i < argc && count < CARDS_MOST; i++)
 		cards[count++] = atoi(argv[i]);
 	if (count == 0)
 		for (int n = 2; n <= 4 && n <= backend_cuda.count(); n += 2)

@@ -101,7 +101,8 @@ static struct recipe recipe_of(int i, const struct grid *grid)
 		recipe.tv.on = true;
 		if (cases[i].tv != TV_OF_THE_NOISE)
 			recipe_explicit_tv(&recipe, (enum tv_method)cases[i].tv);
-		recipe.tv.options.iterations = 5;
+		/* More than the cards take between two exchanges. */
+		recipe.tv.options.iterations = cases[i].tv == TV_GRADIENT || cases[i].tv == TV_PROXIMAL ? 19 : 5;
 	}
 	return recipe;
 }
