@@ -192,16 +192,107 @@ bool warning_is_known(const char *code)
 	return warning_kind(code)->code[0] != 0;
 }
 
-void warning_tell(const struct warning_sink *sink, const char *code, const char *format, ...)
+/* ---- lists of projections ---- */
+
+void warning_views_add(struct warning_views *views, int projection)
 {
-	char detail[320];
-	va_list args;
+	int *last = views->ranges > 0 ? views->range[views->ranges - 1] : NULL;
+
+	views->count++;
+	if (last != NULL && last[1] == projection - 1) {
+		last[1] = projection;
+	} else if (views->ranges < WARNING_RANGES_MOST) {
+		views->range[views->ranges][0] = views->range[views->ranges][1] = projection;
+		views->ranges++;
+	}
+}
+
+void warning_views_describe(const struct warning_views *views, char *ret, size_t size)
+{
+	size_t used = 0;
+	int told = 0;
+
+	ret[0] = 0;
+	for (int i = 0; i < views->ranges && used < size; i++) {
+		const int *range = views->range[i];
+
+		used += (size_t)(range[0] == range[1]
+				     ? snprintf(ret + used, size - used, "%s%d", i > 0 ? ", " : "", range[0])
+				     : snprintf(ret + used, size - used, "%s%d to %d", i > 0 ? ", " : "", range[0],
+						range[1]));
+		told += range[1] - range[0] + 1;
+	}
+	if (told < views->count && used < size)
+		snprintf(ret + used, size - used, " and %d more", views->count - told);
+}
+
+/* "count left_out mended first-last first-last ...", as many ranges as the text has room for. */
+static void write_views(const struct warning_views *views, char *ret, size_t size)
+{
+	size_t used = (size_t)snprintf(ret, size, "\t%d %d %d", views->count, views->left_out, views->mended);
+
+	for (int i = 0; i < views->ranges; i++) {
+		const int length = snprintf(ret + used, size - used, " %d-%d", views->range[i][0], views->range[i][1]);
+
+		if (used + (size_t)length >= size) {
+			ret[used] = 0;
+			return;
+		}
+		used += (size_t)length;
+	}
+}
+
+void warning_parse(const char *text, char ret_detail[WARNING_DETAIL_SIZE], struct warning_views *ret_views)
+{
+	const char *tab = strchr(text, '\t');
+	const int length = tab != NULL ? (int)(tab - text) : (int)strlen(text);
+	struct warning_views views = {0};
+	int used = 0;
+
+	snprintf(ret_detail, WARNING_DETAIL_SIZE, "%.*s", length, text);
+	if (tab != NULL && sscanf(tab, "\t%d %d %d%n", &views.count, &views.left_out, &views.mended, &used) == 3) {
+		for (const char *at = tab + used; views.ranges < WARNING_RANGES_MOST; at += used) {
+			int *range = views.range[views.ranges];
+
+			if (sscanf(at, " %d-%d%n", &range[0], &range[1], &used) != 2)
+				break;
+			views.ranges++;
+		}
+	}
+	*ret_views = views;
+}
+
+static void tell(const struct warning_sink *sink, const char *code, const struct warning_views *views,
+		 const char *format, va_list args)
+{
+	char text[WARNING_TEXT_SIZE];
+	size_t used;
 
 	assert(warning_is_known(code));
 	if (sink->tell == NULL)
 		return;
+	vsnprintf(text, WARNING_DETAIL_SIZE, format, args);
+	used = strlen(text);
+	if (views != NULL && views->count > 0)
+		write_views(views, text + used, sizeof(text) - used);
+	sink->tell(sink->context, code, text);
+}
+
+void warning_tell_views(const struct warning_sink *sink, const char *code, const struct warning_views *views,
+			const char *format, ...)
+{
+	va_list args;
+
 	va_start(args, format);
-	vsnprintf(detail, sizeof(detail), format, args);
+	tell(sink, code, views, format, args);
 	va_end(args);
-	sink->tell(sink->context, code, detail);
+}
+
+void warning_tell(const struct warning_sink *sink, const char *code, const char *format, ...)
+{
+	va_list args;
+
+	va_start(args, format);
+	tell(sink, code, NULL, format, args);
+	va_end(args);
 }

@@ -2,6 +2,7 @@
 #define CBCT_CORE_WARNING_H
 
 #include <stdbool.h>
+#include <stddef.h>
 
 /*
  * Every warning that a scan or a job may carry: one row for each code. Where a
@@ -41,6 +42,27 @@ struct warning_sink {
 	void *context;
 	void (*tell)(void *context, const char *code, const char *detail); /* NULL: nobody */
 };
+/*
+ * The projections that a warning is about. In the text that `tell` gets they stand behind the detail and a tab; whoever
+ * shows or keeps a warning takes it apart with warning_parse.
+ */
+enum { WARNING_RANGES_MOST = 24 };
+struct warning_views {
+	int count;                                 /* of all of them; 0: the warning has no list */
+	int left_out, mended;                      /* of these: not in the image; made whole again, and in it */
+	int ranges, range[WARNING_RANGES_MOST][2]; /* first and last, rising; those that do not fit are only counted */
+};
+/* Adds a projection to the list, the next one in rising order. */
+void warning_views_add(struct warning_views *views, int projection);
+enum { WARNING_DETAIL_SIZE = 320, WARNING_TEXT_SIZE = 512 };
+void warning_parse(const char *text, char ret_detail[WARNING_DETAIL_SIZE], struct warning_views *ret_views);
+/* "7 to 10, 12 and 3 more"; "" where there are none. */
+void warning_views_describe(const struct warning_views *views, char *ret, size_t size);
+
+/* The same as warning_tell, with a list. */
+__attribute__((format(printf, 4, 5))) void warning_tell_views(const struct warning_sink *sink, const char *code,
+							      const struct warning_views *views, const char *format,
+							      ...);
 /* A code of the table, and the technical detail, which is cut off at 319 characters. */
 __attribute__((format(printf, 3, 4))) void warning_tell(const struct warning_sink *sink, const char *code,
 							const char *format, ...);

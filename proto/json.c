@@ -960,14 +960,31 @@ cJSON *json_runs(const unsigned char *flags, int count, bool value)
 	return runs;
 }
 
-cJSON *json_warning(const char *code, const char *detail)
+/* Ranges, as those of `missing`. */
+static void add_warning_views(cJSON *warning, const struct warning_views *views)
+{
+	cJSON *list = cJSON_AddArrayToObject(warning, "views");
+
+	for (int i = 0; i < views->ranges; i++)
+		cJSON_AddItemToArray(list, cJSON_CreateIntArray(views->range[i], 2));
+	cJSON_AddNumberToObject(warning, "view_count", views->count);
+	cJSON_AddNumberToObject(warning, "left_out", views->left_out);
+	cJSON_AddNumberToObject(warning, "mended", views->mended);
+}
+
+cJSON *json_warning(const char *code, const char *text)
 {
 	const struct warning_kind *kind = warning_kind(code);
 	cJSON *warning = cJSON_CreateObject();
+	char detail[WARNING_DETAIL_SIZE];
+	struct warning_views views;
 
+	warning_parse(text, detail, &views);
 	cJSON_AddStringToObject(warning, "code", code);
 	cJSON_AddStringToObject(warning, "severity", severity_names[kind->severity]);
 	cJSON_AddStringToObject(warning, "summary", kind->summary);
 	cJSON_AddStringToObject(warning, "detail", detail);
+	if (views.count > 0)
+		add_warning_views(warning, &views);
 	return warning;
 }

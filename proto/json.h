@@ -111,7 +111,7 @@ int json_fail(struct json_reader *reader, int code, const char *name, const char
  * A warning as the API shows it: code, severity, summary (both of core/warning.h)
  * and the technical detail. The caller's to delete.
  */
-cJSON *json_warning(const char *code, const char *detail);
+cJSON *json_warning(const char *code, const char *text);
 
 /* A time in seconds since 1970 as text (clock_text); null where it is not above 0, not known. */
 void json_add_time(cJSON *object, const char *name, double seconds);

@@ -97,29 +97,40 @@ static int apply(const struct correction_job *job, void *state, enum correction_
 	return time == CORRECT_AFTER_FDK ? blank_make_up(job, job->volume, ret_changed, err) : leave_out(job, err);
 }
 
-/* Outliers of a kind: how many, how many of these are mended, the first of them, and the one that is the worst. */
+/* A view's number among all projections of the scan, of which some may have never come. */
+static int number_of(const struct input *input, int view)
+{
+	return input->given.numbers != NULL ? input->given.numbers[view] : view;
+}
+
+/* Outliers of a kind, numbers of the scan's projections: the first of them, and the one that is the worst. */
 struct outlier_report {
-	int count, mended, first, worst;
+	struct warning_views views;
+	int first, worst;
 	float amount; /* of the worst */
 };
 
 static struct outlier_report report_of(const struct input *input, int views, enum outlier_kind kind)
 {
-	struct outlier_report report = {0};
+	struct outlier_report report = {.first = -1};
 
-	for (int i = views - 1; i >= 0; i--) {
+	for (int i = 0; i < views; i++) {
 		const struct outlier *outlier = &input->outliers[i];
+		const int number = number_of(input, i);
 
 		if (outlier->kind != kind)
 			continue;
-		report.count++;
-		report.mended += input_is_mended(input, i);
-		report.first = i;
-		if (fabsf(outlier->amount) >= fabsf(report.amount)) {
-			report.worst = i;
+		warning_views_add(&report.views, number);
+		report.views.mended += input_is_mended(input, i);
+		report.first = report.first < 0 ? number : report.first;
+		if (fabsf(outlier->amount) > fabsf(report.amount) || report.views.count == 1) {
+			report.worst = number;
 			report.amount = outlier->amount;
 		}
 	}
+	for (int i = input->counts.blank - input->held_out - input->left_out; i < input->counts.blank - input->held_out;
+	     i++)
+		report.views.left_out += input->outliers[input->blank[i]].kind == kind;
 	return report;
 }
 
@@ -140,12 +151,14 @@ static void warn_of_kept(const struct input *input, int views, const struct warn
 static void warn_of_outliers(const struct input *input, int views, const struct warning_sink *sink)
 {
 	struct outlier_report reports[OUTLIER_KINDS];
+	const struct outlier_report *dark = &reports[OUTLIER_DARK], *frozen = &reports[OUTLIER_FROZEN],
+				    *level = &reports[OUTLIER_LEVEL], *shifted = &reports[OUTLIER_SHIFTED];
 	char done[96], parts[96];
 	int count = 0;
 
 	for (int kind = OUTLIER_DARK; kind < OUTLIER_KINDS; kind++) {
 		reports[kind] = report_of(input, views, (enum outlier_kind)kind);
-		count += reports[kind].count - reports[kind].mended;
+		count += reports[kind].views.count - reports[kind].views.mended;
 	}
 	snprintf(parts, sizeof(parts), "Opposite rays stand in for %.0f %% of that, the views beside for the rest",
 		 100 * input->opposite);
@@ -153,31 +166,68 @@ static void warn_of_outliers(const struct input *input, int views, const struct 
 		snprintf(done, sizeof(done), "They are left out, the others stand in for them");
 	else
 		snprintf(done, sizeof(done), "%d of them and of other such ones are left out", input->left_out);
-	if (reports[OUTLIER_DARK].count > 0)
-		warning_tell(sink, "dark_parts",
-			     "%d projections, the first of them is %d, have parts without a usable sample, or with "
-			     "another signal, that those beside them do not have, %.3g %% of projection %d. %s",
-			     reports[OUTLIER_DARK].count, reports[OUTLIER_DARK].first,
-			     100 * (double)reports[OUTLIER_DARK].amount, reports[OUTLIER_DARK].worst,
-			     reports[OUTLIER_DARK].mended == reports[OUTLIER_DARK].count ? parts : done);
-	if (reports[OUTLIER_FROZEN].count > 0)
-		warning_tell(sink, "frozen_views",
-			     "%d projections, the first of them is %d, are the very ones before them. %s",
-			     reports[OUTLIER_FROZEN].count, reports[OUTLIER_FROZEN].first, done);
-	if (reports[OUTLIER_LEVEL].count > 0)
-		warning_tell(sink, "dose_steps",
-			     "%d projections, the first of them is %d, were taken with another dose than those beside "
-			     "them: %.3g times as bright all over in projection %d. %s",
-			     reports[OUTLIER_LEVEL].count, reports[OUTLIER_LEVEL].first,
-			     exp(-(double)reports[OUTLIER_LEVEL].amount), reports[OUTLIER_LEVEL].worst,
-			     reports[OUTLIER_LEVEL].mended == reports[OUTLIER_LEVEL].count ? "That was taken off them"
-											   : done);
-	if (reports[OUTLIER_SHIFTED].count > 0)
-		warning_tell(sink, "shifted_views",
-			     "%d projections, the first of them is %d, lie aside of those beside them, by %.3g %% of "
-			     "the detector in projection %d: did the patient or the arm move? %s",
-			     reports[OUTLIER_SHIFTED].count, reports[OUTLIER_SHIFTED].first,
-			     100 * fabs((double)reports[OUTLIER_SHIFTED].amount), reports[OUTLIER_SHIFTED].worst, done);
+	if (dark->views.count > 0)
+		warning_tell_views(sink, "dark_parts", &dark->views,
+				   "%d projections, the first of them is %d, have parts without a usable sample, or "
+				   "with another signal, that those beside them do not have, %.3g %% of projection %d. "
+				   "%s",
+				   dark->views.count, dark->first, 100 * (double)dark->amount, dark->worst,
+				   dark->views.mended == dark->views.count ? parts : done);
+	if (frozen->views.count > 0)
+		warning_tell_views(sink, "frozen_views", &frozen->views,
+				   "%d projections, the first of them is %d, are the very ones before them. %s",
+				   frozen->views.count, frozen->first, done);
+	if (level->views.count > 0)
+		warning_tell_views(sink, "dose_steps", &level->views,
+				   "%d projections, the first of them is %d, were taken with another dose than those "
+				   "beside them: %.3g times as bright all over in projection %d. %s",
+				   level->views.count, level->first, exp(-(double)level->amount), level->worst,
+				   level->views.mended == level->views.count ? "That was taken off them" : done);
+	if (shifted->views.count > 0)
+		warning_tell_views(
+		    sink, "shifted_views", &shifted->views,
+		    "%d projections, the first of them is %d, lie aside of those beside them, by %.3g %% of "
+		    "the detector in projection %d: did the patient or the arm move? %s",
+		    shifted->views.count, shifted->first, 100 * fabs((double)shifted->amount), shifted->worst, done);
+}
+
+static int compare_numbers(const void *a, const void *b)
+{
+	const int x = *(const int *)a, y = *(const int *)b;
+
+	return (x > y) - (x < y);
+}
+
+/* Views without a good pixel, and behind them those that show nothing. */
+static int warn_of_nothing(const struct input *input, int nothing, int empty, const struct warning_sink *sink,
+			   struct error *err)
+{
+	struct warning_views views = {0};
+	int *numbers = malloc((size_t)nothing * sizeof(*numbers));
+
+	if (numbers == NULL)
+		return error_set(err, ERR_NO_MEMORY, "no memory for a list of %d views", nothing);
+	for (int i = 0; i < nothing; i++)
+		numbers[i] = number_of(input, input->blank[i]);
+	qsort(numbers, (size_t)nothing, sizeof(*numbers), compare_numbers);
+	for (int i = 0; i < nothing; i++)
+		warning_views_add(&views, numbers[i]);
+	views.left_out = nothing;
+	if (empty > 0)
+		warning_tell_views(
+		    sink, "blank_views", &views,
+		    "%d projections show nothing, the first of them is %d: %d have no good pixel, and %d one "
+		    "value or mere noise all over, as with a closed shutter or without the patient. They are "
+		    "left out, the others stand in for them",
+		    nothing, numbers[0], nothing - empty, empty);
+	else
+		warning_tell_views(
+		    sink, "blank_views", &views,
+		    "%d projections have no good pixel, the first of them is %d: they are left out, the others stand "
+		    "in for them",
+		    nothing, numbers[0]);
+	free(numbers);
+	return 0;
 }
 
 static int warn(const struct correction_job *job, void *state, struct error *err)
@@ -185,28 +235,12 @@ static int warn(const struct correction_job *job, void *state, struct error *err
 	const struct input *input = job->input;
 	const int others = input->left_out + input->held_out;
 	const int nothing = input->counts.blank - others, empty = input->empty - others;
-	int first = job->geometry->count;
 
 	(void)state;
-	(void)err;
 	/* Outliers and views that are held out are the last ones of the list. */
-	for (int i = 0; i < nothing; i++)
-		first = input->blank[i] < first ? input->blank[i] : first;
 	warn_of_outliers(input, job->geometry->count, job->warnings);
 	warn_of_kept(input, job->geometry->count, job->warnings);
-	if (empty > 0)
-		warning_tell(job->warnings, "blank_views",
-			     "%d projections show nothing, the first of them is %d: %d have no good pixel, and %d one "
-			     "value or mere noise all over, as with a closed shutter or without the patient. They are "
-			     "left out, the others stand in for them",
-			     nothing, first, nothing - empty, empty);
-	else if (nothing > 0)
-		warning_tell(
-		    job->warnings, "blank_views",
-		    "%d projections have no good pixel, the first of them is %d: they are left out, the others stand "
-		    "in for them",
-		    nothing, first);
-	return 0;
+	return nothing > 0 ? warn_of_nothing(input, nothing, empty, job->warnings, err) : 0;
 }
 
 extern const struct correction correction_blank_views;

@@ -6,6 +6,7 @@
 #include <stdlib.h>
 #include <string.h>
 
+#include "core/warning.h"
 #include "daemon/log.h"
 #include "proto/clock.h"
 #include "proto/digest.h"
@@ -428,7 +429,37 @@ static void add_request(cJSON *document, const struct job *job, const struct job
 	cJSON_Delete(request);
 }
 
-static int add_warnings(cJSON *document, struct store *store, const char *id, struct error *err)
+static void add_to_number(cJSON *object, const char *name, int more)
+{
+	const cJSON *number = cJSON_GetObjectItemCaseSensitive(object, name);
+	const int now = cJSON_IsNumber(number) ? number->valueint : 0;
+
+	cJSON_DeleteItemFromObjectCaseSensitive(object, name);
+	cJSON_AddNumberToObject(object, name, now + more);
+}
+
+/* Projections that were left out are none of the reconstruction's. What a code told last holds: a job may begin anew.
+ */
+static void count_views(cJSON *views, enum job_state state, const struct warning_record *warnings, int count)
+{
+	for (int i = 0; i < count; i++) {
+		char detail[WARNING_DETAIL_SIZE];
+		struct warning_views told;
+		bool last = true;
+
+		for (int later = i + 1; later < count; later++)
+			last = last && strcmp(warnings[later].code, warnings[i].code) != 0;
+		warning_parse(warnings[i].detail, detail, &told);
+		if (!last || told.count == 0)
+			continue;
+		add_to_number(views, "left_out", told.left_out);
+		add_to_number(views, "mended", told.mended);
+		if (state == JOB_SUCCEEDED)
+			add_to_number(views, "reconstructed", -told.left_out);
+	}
+}
+
+static int add_warnings(cJSON *document, struct store *store, enum job_state state, const char *id, struct error *err)
 {
 	struct warning_record *warnings;
 	int count, code = store_job_warnings(store, id, &warnings, &count, err);
@@ -439,6 +470,8 @@ static int add_warnings(cJSON *document, struct store *store, const char *id, st
 	list = cJSON_AddArrayToObject(document, "warnings");
 	for (int i = 0; i < count; i++)
 		add_warning(list, warnings[i].code, warnings[i].detail);
+	if (cJSON_IsObject(cJSON_GetObjectItemCaseSensitive(document, "views")))
+		count_views(cJSON_GetObjectItemCaseSensitive(document, "views"), state, warnings, count);
 	free(warnings);
 	return 0;
 }
@@ -503,7 +536,7 @@ cJSON *job_document(struct job *job, bool brief, struct error *err)
 
 		code = add_volume_count(document, store, record.id, err);
 		if (code == 0)
-			code = add_warnings(document, store, record.id, err);
+			code = add_warnings(document, store, record.state, record.id, err);
 		if (code == 0)
 			code = add_sendings(document, job, err);
 		if (code == 0)

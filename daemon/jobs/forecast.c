@@ -151,7 +151,10 @@ int jobs_rates(struct jobs *jobs, struct job_rate ret_rates[JOB_RATES])
 	return count;
 }
 
-/* Of a job that runs. */
+/*
+ * Of a job that runs. Between two stages, where a new one has no measure yet, what was told before goes on: who has
+ * been told a time is told one until the end.
+ */
 static double rest(struct job *job, double now)
 {
 	const struct job_record *record = &job->record;
@@ -166,6 +169,12 @@ static double rest(struct job *job, double now)
 		left = first * (1 - job->run_fraction) - (now - job->run_since);
 	else if (done > 0.01)
 		left = (now - job->run_since) * (1 - record->fraction) / done;
+	if (isnan(left) && job->rest_at > 0) {
+		left = job->rest - (now - job->rest_at);
+	} else if (!isnan(left)) {
+		job->rest = left;
+		job->rest_at = now;
+	}
 	return left < 0 ? 0 : left;
 }
 

@@ -53,8 +53,9 @@ struct job {
 	double stage_since;            /* monotonic seconds, while running; 0 before this process saw it run */
 	double run_since;              /* monotonic seconds */
 	double run_fraction;           /* at run_since */
-	double row_at;      /* monotonic seconds of the last history row, or of the last moment before the first */
-	double row_seconds; /* smoothed time from row to row, 0 before the first */
+	double rest, rest_at; /* what was told of the time left while it runs, and when, monotonic; 0: nothing yet */
+	double row_at;        /* monotonic seconds of the last history row, or of the last moment before the first */
+	double row_seconds;   /* smoothed time from row to row, 0 before the first */
 };
 
 /* Somebody who has posted jobs; there until the end. */

@@ -69,6 +69,8 @@ test_views_that_show_nothing_are_told_and_left_out() {
 	reconstruct "$work/empty" "{\"scan\": \"SCAN\", $grid}"
 	expect_json '[.warnings[] | select(.code == "blank_views") | .severity, (.detail | test("^4 projections show nothing, the first of them is 7"))] == ["caution", true]'
 	expect_json '.warnings | all(.code != "no_object")'
+	expect_json '[.warnings[] | select(.code == "blank_views") | .views, .view_count, .left_out, .mended] == [[[7, 8], [30, 30], [52, 52]], 4, 4, 0]'
+	expect_json '.views == {received: 60, reconstructed: 56, of: 60, left_out: 4, mended: 0}'
 	get_volume final "$work/empty.nii"
 	# What four views of 60 take away; 40 HU where they are believed.
 	expect_number "$(cbct compare --json "$work/empty.nii" "$work/good.nii" | jq '.rmse / 0.0192 * 1000')" '<' 12 "RMSE in HU"
@@ -97,6 +99,8 @@ test_views_between_two_steps_are_made_whole() {
 		read -r name code told <<<"$row"
 		reconstruct "$work/$name" "{\"scan\": \"SCAN\", $grid}"
 		expect_json "[.warnings[] | select(.code == \"$code\") | .severity, (.detail | test(\"$told projections, the first of them is 50,\"))] == [\"caution\", true]"
+		expect_json ".views | .reconstructed == 120 and .left_out == 0 and .mended == ${told#^}"
+		expect_json "[.warnings[] | select(.code == \"$code\") | .views, .mended] == [[[50, 49 + ${told#^}]], ${told#^}]"
 		# and by that warning alone
 		[ "$(json "[.warnings[].code | select(. != \"$code\")] | sort | join(\" \")")" = "$(cat "$work/codes")" ] ||
 			fail "$name: other warnings than those of the good scan"

@@ -306,6 +306,23 @@ START_TEST(only_a_run_from_the_start_is_an_attempt)
 }
 END_TEST
 
+START_TEST(a_running_job_that_has_a_time_left_keeps_one)
+{
+	struct job *job = state_post(&state, scan, "routine");
+	const struct job_change yielded = {.checkpoint = 1, .yielded = true};
+
+	state_set(job, JOB_RUNNING, NULL);
+	ck_assert_double_lt(job_eta(job), 0);
+	job_progress(job, STAGE_SART, 0, 0.5);
+	ck_assert_double_ge(job_eta(job), 0);
+	/* Of this run nothing is done yet. */
+	state_set(job, JOB_QUEUED, &yielded);
+	state_set(job, JOB_RUNNING, NULL);
+	ck_assert_double_ge(job_eta(job), 0);
+	job_release(job);
+}
+END_TEST
+
 START_TEST(a_running_job_is_queued_again_after_a_restart)
 {
 	struct job *first = state_post(&state, scan, "routine"), *second = state_post(&state, scan, "routine");
@@ -961,6 +978,7 @@ Suite *job_suite(void)
 	tcase_add_test(tests, a_waiting_job_is_found_again_after_a_restart);
 	tcase_add_test(tests, one_that_yielded_stands_in_front_of_its_class);
 	tcase_add_test(tests, only_a_run_from_the_start_is_an_attempt);
+	tcase_add_test(tests, a_running_job_that_has_a_time_left_keeps_one);
 	tcase_add_test(tests, a_running_job_is_queued_again_after_a_restart);
 	tcase_add_test(tests, a_checkpoint_is_kept_over_a_restart_where_its_file_is);
 	tcase_add_test(tests, a_failed_job_reads_the_same_after_a_restart);

@@ -80,7 +80,14 @@ const severities = ['serious', 'caution', 'info']
 export function warningList(warnings) {
 	return warnings.length === 0 ? null : h('ul', { class: 'warnings' },
 		[...warnings].sort((a, b) => severities.indexOf(a.severity) - severities.indexOf(b.severity)).map(
-			({ code, severity, summary, detail }) => h('li', { class: severity },
+			({ code, severity, summary, detail, views, view_count }) => h('li', { class: severity },
 				h('strong', {}, t(severity)), ` ${t(summary)} `,
-				h('details', {}, h('summary', {}, t('Figures')), detail, ' ', h('code', {}, code)))))
+				h('details', {}, h('summary', {}, t('Figures')), detail, ' ',
+					view_count > 1 && `${t('Projections: {list}', { list: listed(views, view_count) })} `, h('code', {}, code)))))
+}
+
+/* Ranges of projections: "7–10, 12, …" */
+function listed(views, count) {
+	const told = views.reduce((sum, [first, last]) => sum + last - first + 1, 0)
+	return [...views.map(([first, last]) => first === last ? `${first}` : `${first}–${last}`), ...told < count ? ['…'] : []].join(', ')
 }

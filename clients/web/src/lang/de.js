@@ -479,6 +479,7 @@ export const strings = {
 	'all parameters by hand': 'alle Parameter von Hand',
 	'as this job, with what is changed below': 'wie dieser Auftrag, mit dem, was unten geändert wird',
 	'All parameters': 'Alle Parameter',
+	'Projections: {list}': 'Projektionen: {list}',
 	'{n} of them in FDK so far': '{n} davon bisher in FDK',
 	'{n} defect pixel is red': '{n} defektes Pixel ist rot',
 	'{n} defect pixels are red': '{n} defekte Pixel sind rot',
