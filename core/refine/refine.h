@@ -20,7 +20,8 @@
  *
  * One view in eight has no part in volume and path. What the volume says of these views, moved as the path says, is
  * held against what the same iterations say of them without any motion; a path is kept only where that is better, and
- * where the path is larger than what such paths are where there is nothing to find.
+ * where the path is larger than most that are found where there is nothing to find (one of 17 such scans keeps one, of
+ * .06 mm, and is the better for it).
  *
  * What all views share is no motion. Nor does a scan tell how large the object is: the way along the beam is expected
  * to be small. Bins limit what can be found, to about a thirtieth of one.
