@@ -26,6 +26,11 @@ for (const [, words] of presets)
 let missing = 0
 for (const file of readdirSync(join(sources, 'lang'))) {
 	const { strings } = await import(pathToFileURL(join(sources, 'lang', file)))
+	const keys = [...readFileSync(join(sources, 'lang', file), 'utf8').matchAll(/^\t('(?:[^'\\\n]|\\.)*'):/gm)].map(([, key]) => key)
+	for (const key of keys.filter((key, i) => keys.indexOf(key) !== i)) {
+		console.log(`lang/${file}: ${key} twice`)
+		missing++
+	}
 	for (const words of wanted) {
 		if (strings[words] === undefined) {
 			console.log(`lang/${file} lacks: '${words.replace(/'/g, '\\\'')}'`)

@@ -277,7 +277,6 @@ export const strings = {
 	'more are refused until one is removed': 'weitere werden abgelehnt, bis einer entfernt ist',
 	'more is refused until something is removed': 'mehr wird abgelehnt, bis etwas entfernt ist',
 	'never': 'nie',
-	'routine': 'Routine',
 	'stat': 'sofort',
 	'standard': 'Standard',
 	'reference': 'Referenz',
