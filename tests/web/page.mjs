@@ -712,6 +712,71 @@ test('beside metal the volume is called an estimate, and only there', async () =
 	await page.context().close()
 })
 
+/*
+ * Exact line integrals of balls { center, radius, mu } in mm and 1/mm, from 64 views around z of 64 x 64 pixels; metal is at +x and +y,
+ * the left and the back of a patient who lies HFS.
+ */
+const balls = [{ center: [0, 0, 0], radius: 40, mu: 0.03 }, { center: [18, 22, 6], radius: 5, mu: 0.18 }]
+async function scanOfBalls(wanted) {
+	const side = 64, count = 64, pitch = 3.2
+	const views = Array.from({ length: count }, (_, k) => {
+		const [cos, sin] = [Math.cos(2 * Math.PI * k / count), Math.sin(2 * Math.PI * k / count)], across = [-sin * pitch, cos * pitch, 0], along = [0, 0, -pitch]
+		const corner = [-480 * cos, -480 * sin, 0].map((mm, i) => mm - (side - 1) / 2 * (across[i] + along[i]))
+		return { source_mm: [620 * cos, 620 * sin, 0], pixel0_mm: corner, column_step_mm: across, row_step_mm: along }
+	})
+	const made = await post('/v1/scans', { name: 'balls', patient: { position: 'HFS' }, detector: { columns: side, rows: side, pixel_mm: [pitch, pitch] },
+		projections: { count, sample: 'float32', quantity: 'line_integral' }, geometry: { kind: 'views', views } })
+	for (const [k, { source_mm: source, pixel0_mm: corner, column_step_mm: across, row_step_mm: along }] of views.entries()) {
+		const values = Float32Array.from({ length: side * side }, (_, at) => {
+			const way = corner.map((mm, i) => mm + at % side * across[i] + Math.floor(at / side) * along[i] - source[i]), length = Math.hypot(...way)
+			return wanted.reduce((sum, { center, radius, mu }) => {
+				const to = center.map((mm, i) => mm - source[i]), near = to.reduce((product, mm, i) => product + mm * way[i] / length, 0)
+				const half2 = radius ** 2 - (to.reduce((squares, mm) => squares + mm ** 2, 0) - near ** 2)
+				return half2 > 0 ? sum + 2 * mu * Math.sqrt(half2) : sum
+			}, 0)
+		})
+		await api(`/v1/scans/${made.id}/projections/${k}`, { method: 'PUT', body: values })
+	}
+	return made.id
+}
+
+test('metal has its own colour in 3D, which starts from behind then; the quality\'s reasons are what was measured', async () => {
+	for (const [what, wanted, render] of [['tissue alone', balls.slice(0, 1), 'R L S I'], ['with metal', balls, 'L R S I']]) {
+		const job = await post('/v1/jobs', { scan: await scanOfBalls(wanted), grid: { size: [48, 48, 48], spacing_mm: [2, 2, 2] }, fdk: {}, metal: {} })
+		await ended(job.id)
+		const page = await open(browser, `/#/jobs/${job.id}`)
+		await page.waitForSelector(`${tile('3d')}[data-shown=final]`)
+		await page.waitForSelector(`${tile('3d')} canvas.flat[data-side="384"]`)
+		const { blue, ivory, middle } = await page.evaluate(() => {
+			const canvas = document.querySelector('canvas.flat'), { width, height } = canvas, { data } = canvas.getContext('2d').getImageData(0, 0, width, height)
+			let blue = 0, ivory = 0, x = 0, y = 0
+			for (let i = 0; i < width * height; i++) {
+				const [red, , b] = data.subarray(4 * i, 4 * i + 3)
+				ivory += red > b + 8
+				if (b > red + 30)
+					[blue, x, y] = [blue + 1, x + i % width / width, y + Math.floor(i / width) / height]
+			}
+			return { blue, ivory, middle: [x / blue, y / blue] }
+		})
+		expect(ivory > 5000, `${what}: tissue like ivory, got ${ivory} pixels`)
+		/* Seen from behind the patient's left is on the left, and z upwards. */
+		expect(wanted.length > 1 ? blue > 200 && middle[0] < 0.47 && middle[1] < 0.5 : blue === 0, `${what}: metal blue at its place, got ${blue} pixels about ${middle}`)
+		await shoot(page, `3d-${what.replace(' ', '-')}`)
+		await page.focus(tile('3d'))
+		for (let i = 0; i < 4; i++)
+			await page.keyboard.press('ArrowLeft')
+		expect(await edges(page, '3d') === render, `${what}: ${render} about the rendering, got ${await edges(page, '3d')}`)
+		const { quality } = (await api(`/v1/jobs/${job.id}/volumes`)).volumes.at(-1), said = await page.textContent('p.quality')
+		for (const [pattern, value] of [[/noise ([\d.]+) HU/, quality.noise_hu], [/edges ([\d.]+) mm wide/, quality.edge_mm], [/([\d.]+) % of it metal/, quality.metal_share > 0 ? 100 * quality.metal_share : null]]) {
+			const number = said.match(pattern)?.[1]
+			expect(value === null ? number === undefined : Math.abs(Number(number) - value) <= 0.06 * value, `${what}: ${value} said by ${pattern}, got: ${said}`)
+		}
+		expect(quality.noise_hu !== null || quality.edge_mm !== null, `${what}: there are reasons, got ${JSON.stringify(quality)}`)
+		expect((quality.metal_share > 0) === (wanted.length > 1), `${what}: metal in the quality, got ${quality.metal_share}`)
+		await page.context().close()
+	}
+})
+
 test('3D: the maximum along each ray is the daemon\'s, the rendering is zoomed, panned, cut and off', async () => {
 	const page = await openFinished(), { size, spacing_mm: spacing, origin_mm: corner } = (await api(`/v1/jobs/${finished}/volumes`)).volumes[0]
 	await page.waitForSelector(`${tile('3d')}[data-shown=final]`)
