@@ -283,6 +283,20 @@ static bool reaches_edge(const struct edge *edge, int dark, const struct border 
 	return true;
 }
 
+/*
+ * True if the values hardly change as far again on either side of the border. Where they go on, it is no edge but the
+ * slope of a plate that is seen from above, or of the wall of a tube around the field.
+ */
+static bool stands_alone(const struct edge *edge, int dark, int length, const struct border *border)
+{
+	const int inwards = dark + 2 * length, outwards = dark - length;
+	const float most = SHARE * border->step;
+
+	return (inwards >= edge->profiles->bins ||
+		quantile_of(edge, dark + length, inwards, border->first, border->end, 0.5) <= most) &&
+	       (outwards < 0 || quantile_of(edge, outwards, dark, border->first, border->end, 0.5) <= most);
+}
+
 /* The bins of the shadow's border that are partly in shadow are taken for shadow. */
 static int penumbra_end(const struct edge *edge, int bins, const struct border *border)
 {
@@ -304,7 +318,7 @@ static struct border find_border(const struct edge *edge)
 			struct border border;
 
 			if (!border_at(edge, dark, dark + length, &border) || border.step <= best.step ||
-			    !reaches_edge(edge, dark, &border))
+			    !reaches_edge(edge, dark, &border) || !stands_alone(edge, dark, length, &border))
 				continue;
 			border.bins = penumbra_end(edge, dark + length, &border);
 			if (border.bins <= most)

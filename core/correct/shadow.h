@@ -15,8 +15,9 @@
  * across the rows in each segment of the columns. A shadow begins at the detector's edge, takes at most 40 % of the
  * columns or rows, and ends within four bins: there the profiles fall by the same step, at least SHADOW_LEAST, to 30 %
  * of it and 0.05, in all segments and views, or by less where the object begins at the border and the shadow has air
- * behind it. An object has no such edge: its own step changes along it and from view to view. 15 % of the views may
- * differ in a segment, for metal and noise, and segments at the ends that lie in a shadow of the other direction.
+ * behind it. An object has no such edge: its own step changes along it and from view to view, or goes on on one side,
+ * as the slope of a plate does that is seen from above. 15 % of the views may differ in a segment, for metal and noise,
+ * and segments at the ends that lie in a shadow of the other direction.
  *
  * None is found where nothing is seen beside the shadows: they might be all of a wide, flat object.
  */

@@ -13,9 +13,14 @@ Suite *shadow_suite(void);
 enum { COLUMNS = 80, ROWS = 48, PIXELS = COLUMNS * ROWS, VIEWS = 32, PARTS_MOST = 6 };
 static const float FLAT = 60000;
 
-/* HEAD ends within the detector, WIDE nowhere; DISCS are seen edge on, as wide as the detector. */
-enum object { HEAD, WIDE, DISCS, METAL, FLAT_END, OBJECTS };
-static const char *const names[] = {"head", "wide body", "discs", "metal", "wide body that ends in the middle"};
+/*
+ * HEAD ends within the detector, WIDE nowhere; DISCS are seen edge on, as wide as the detector; the PLATE that a body
+ * stands on is wider than the field and seen from above, the TUBE's wall lies just outside of it.
+ */
+enum object { HEAD, WIDE, DISCS, METAL, FLAT_END, PLATE, TUBE, OBJECTS };
+static const char *const names[] = {
+    "head", "wide body", "discs", "metal", "wide body that ends in the middle", "plate", "tube",
+};
 static const struct ellipsoid objects[OBJECTS][PARTS_MOST] = {
     [HEAD] = {{.shape = SHAPE_ELLIPSOID, .semi_axes = {72, 84, 110}, .density = .035},
 	      {.shape = SHAPE_ELLIPSOID, .semi_axes = {66, 78, 104}, .density = -.016},
@@ -30,6 +35,11 @@ static const struct ellipsoid objects[OBJECTS][PARTS_MOST] = {
 	       {.shape = SHAPE_CYLINDER, .semi_axes = {4, 4, 200}, .centre = {135, 0, 0}, .density = .4},
 	       {.shape = SHAPE_BOX, .semi_axes = {140, 2, 200}, .centre = {0, 100, 0}, .density = .2}},
     [FLAT_END] = {{.shape = SHAPE_CYLINDER, .semi_axes = {200, 200, 100}, .centre = {0, 0, -104}, .density = .019}},
+    [PLATE] = {{.shape = SHAPE_CYLINDER, .semi_axes = {60, 60, 30}, .density = .02},
+	       {.shape = SHAPE_CYLINDER, .semi_axes = {200, 200, 60}, .centre = {0, 0, -90}, .density = .02}},
+    [TUBE] = {{.shape = SHAPE_ELLIPSOID, .semi_axes = {72, 84, 110}, .density = .02},
+	      {.shape = SHAPE_CYLINDER, .semi_axes = {130, 130, 400}, .density = .04},
+	      {.shape = SHAPE_CYLINDER, .semi_axes = {122, 122, 400}, .density = -.04}},
 };
 
 static unsigned random_state;
