@@ -224,6 +224,19 @@ static void reconstruct(const struct anatomy_scan *scan, const struct recipe *re
 	backend_cpu.close(device);
 }
 
+static int emit[] = {3, 10};
+
+/* FDK, SART and the default's TV, after three and ten iterations; the recipe becomes that. */
+static void reconstruct_by_default(const struct anatomy_scan *scan, struct recipe *recipe,
+				   struct image_figures ret_figures[2], double *ret_alpha)
+{
+	recipe->tv.on = true;
+	recipe->algorithm = &algorithm_sart;
+	recipe->emit = emit;
+	recipe->emits = 2;
+	reconstruct(scan, recipe, ret_figures, ret_alpha);
+}
+
 /* The scan, a recipe of FDK alone on its grid, and what that gives. Free with anatomy_scan_clear. */
 static void begin_with_fdk(const struct anatomy_spec *spec, struct anatomy_scan *ret_scan, struct recipe *ret_recipe,
 			   struct image_figures *ret_fdk)
@@ -244,15 +257,10 @@ START_TEST(the_default_takes_the_noise_and_leaves_the_anatomy)
 	struct anatomy_scan scan;
 	struct recipe recipe;
 	struct image_figures fdk, found[2], other[2];
-	int emit[] = {3, 10};
 	double alpha, best[2];
 
 	begin_with_fdk(&anatomies[_i], &scan, &recipe, &fdk);
-	recipe.tv.on = true;
-	recipe.algorithm = &algorithm_sart;
-	recipe.emit = emit;
-	recipe.emits = 2;
-	reconstruct(&scan, &recipe, found, &alpha);
+	reconstruct_by_default(&scan, &recipe, found, &alpha);
 	best[THIRD] = found[THIRD].rmse;
 	best[TENTH] = found[TENTH].rmse;
 	recipe_explicit_tv(&recipe, TV_PROXIMAL);
@@ -283,15 +291,10 @@ START_TEST(pixels_finer_than_the_voxels_do_not_make_iterations_worse_than_fdk)
 	struct anatomy_scan scan;
 	struct recipe recipe;
 	struct image_figures fdk, found[2];
-	int emit[] = {3, 10};
 	double alpha;
 
 	begin_with_fdk(&spec, &scan, &recipe, &fdk);
-	recipe.tv.on = true;
-	recipe.algorithm = &algorithm_sart;
-	recipe.emit = emit;
-	recipe.emits = 2;
-	reconstruct(&scan, &recipe, found, &alpha);
+	reconstruct_by_default(&scan, &recipe, found, &alpha);
 	for (int k = THIRD; k <= TENTH; k++)
 		ck_assert_msg(found[k].rmse < 0.75 * fdk.rmse, "iteration %d: %.1f HU, FDK %.1f", emit[k],
 			      found[k].rmse, fdk.rmse);
@@ -312,15 +315,10 @@ START_TEST(iterations_do_not_grow_worse_where_a_voxel_spans_two_pixels)
 	struct anatomy_scan scan;
 	struct recipe recipe;
 	struct image_figures fdk, found[2], asked[2];
-	int emit[] = {3, 10};
 	double alpha;
 
 	begin_with_fdk(&specs[_i], &scan, &recipe, &fdk);
-	recipe.tv.on = true;
-	recipe.algorithm = &algorithm_sart;
-	recipe.emit = emit;
-	recipe.emits = 2;
-	reconstruct(&scan, &recipe, found, &alpha);
+	reconstruct_by_default(&scan, &recipe, found, &alpha);
 	ck_assert_msg(found[TENTH].rmse <= 1.05 * found[THIRD].rmse && found[TENTH].rmse < 0.85 * fdk.rmse,
 		      "from %.1f to %.1f HU, FDK %.1f", found[THIRD].rmse, found[TENTH].rmse, fdk.rmse);
 	if (_i == 0) {
@@ -351,15 +349,10 @@ START_TEST(thin_shells_do_not_make_iterations_worse_than_fdk)
 	struct anatomy_scan scan;
 	struct recipe recipe;
 	struct image_figures fdk, found[2];
-	int emit[] = {3, 10};
 	double alpha;
 
 	begin_with_fdk(&specs[_i], &scan, &recipe, &fdk);
-	recipe.tv.on = true;
-	recipe.algorithm = &algorithm_sart;
-	recipe.emit = emit;
-	recipe.emits = 2;
-	reconstruct(&scan, &recipe, found, &alpha);
+	reconstruct_by_default(&scan, &recipe, found, &alpha);
 	ck_assert_msg(found[TENTH].rmse <= 0.95 * fdk.rmse && found[TENTH].rmse <= 1.05 * found[THIRD].rmse,
 		      "from %.1f to %.1f HU, FDK %.1f", found[THIRD].rmse, found[TENTH].rmse, fdk.rmse);
 	anatomy_scan_clear(&scan);
