@@ -35,21 +35,31 @@ static bool hear(void *context)
 	return atomic_load(&smoothing->cancelled);
 }
 
+/* The slices low .. high - 1 of the whole volume that belong to slab s and are smoothed on this card; none if not
+ * below. */
+static void shared_slices(const struct smoothing *smoothing, const struct card_plan *card, int s, int *ret_low,
+			  int *ret_high)
+{
+	const int *first = smoothing->volume->first, end = card->tv_first + card->tv_grid.size[2];
+
+	*ret_low = first[s] > card->tv_first ? first[s] : card->tv_first;
+	*ret_high = first[s + 1] < end ? first[s + 1] : end;
+}
+
 /* Takes the slab and the slices beside it from the cards that have them. */
 static int take_slices(void *context, int c, struct error *err)
 {
 	const struct smoothing *smoothing = context;
 	const struct plan *plan = smoothing->plan;
 	const struct card_plan *card = &plan->card[c];
-	const int *first = smoothing->volume->first, end = card->tv_first + card->tv_grid.size[2];
 	int code = 0;
 
 	for (int s = 0; s < plan->parts && c < plan->parts && code == 0; s++) {
-		const int low = first[s] > card->tv_first ? first[s] : card->tv_first;
-		const int high = first[s + 1] < end ? first[s + 1] : end;
+		int low, high;
 
-		code = cards_pass_slices(plan->device, smoothing->volume->part[s], low - first[s], card->smoothed,
-					 low - card->tv_first, high - low, plan->host, err);
+		shared_slices(smoothing, card, s, &low, &high);
+		code = cards_pass_slices(plan->device, smoothing->volume->part[s], low - smoothing->volume->first[s],
+					 card->smoothed, low - card->tv_first, high - low, plan->host, err);
 	}
 	return code;
 }
@@ -76,14 +86,13 @@ static int take_steps(void *context, int c, struct error *err)
 	const struct smoothing *smoothing = context;
 	const struct plan *plan = smoothing->plan;
 	const struct card_plan *card = &plan->card[c];
-	const int *first = smoothing->volume->first, end = card->tv_first + card->tv_grid.size[2];
 	int code = 0;
 
 	for (int s = 0; s < plan->parts && c < plan->parts && code == 0; s++) {
 		const struct card_plan *other = &plan->card[s];
-		const int low = first[s] > card->tv_first ? first[s] : card->tv_first;
-		const int high = first[s + 1] < end ? first[s + 1] : end;
+		int low, high;
 
+		shared_slices(smoothing, card, s, &low, &high);
 		if (s != c && low < high)
 			code = plan->device->backend->tv_pass(other->tv, other->smoothed, low - other->tv_first,
 							      card->tv, card->smoothed, low - card->tv_first,
