@@ -7,13 +7,14 @@
  * malloc, send, recv; each stands for all calls of its kind, open for openat, malloc for calloc and realloc) of a
  * process of PROGRAM ("cbctd", "cbct-worker"; the held ones too) fails, once: KIND is an error number, or "short" for
  * half of the bytes. FILE.fired is made then, with the path of the program or library that called, and while it is
- * there no other process fails. FILE.count grows by a byte for each call of the program that N would count, where N is
- * 0. FILE.left gets a line of each process that ends with status 0: blocks of memory and descriptors that are left.
- * The C library's own calls (stdio) are not seen.
+ * there no other process fails; the lines after it are the stack, for addr2line. FILE.count grows by a byte for each
+ * call of the program that N would count, where N is 0. FILE.left gets a line of each process that ends with status 0:
+ * blocks of memory and descriptors that are left. The C library's own calls (stdio) are not seen.
  */
 #define _GNU_SOURCE
 #include <dlfcn.h>
 #include <errno.h>
+#include <execinfo.h>
 #include <fcntl.h>
 #include <stdarg.h>
 #include <stdatomic.h>
@@ -38,6 +39,7 @@ static char wanted[32], fired[600], left_path[600];
 static long number;
 static int error_number; /* 0: short */
 static int counter = -1; /* descriptor of FILE.count */
+static void *stack[40];
 static atomic_long calls;
 static atomic_long live; /* blocks that are allocated and not freed */
 
@@ -75,6 +77,7 @@ __attribute__((constructor)) static void arm(void)
 	snprintf(left_path, sizeof(left_path), "%s.left", file);
 	counter = (int)syscall(SYS_openat, AT_FDCWD, count, O_WRONLY | O_CREAT | O_APPEND | O_CLOEXEC, 0600);
 	on_exit(tell, NULL);
+	backtrace(stack, 1); /* The first one loads what unwinds a stack. */
 }
 
 /* Counts a call; true when this is the one. Nothing here goes through what is wrapped. */
@@ -96,6 +99,8 @@ static bool is_it_of(const char *call, void *caller)
 	if (file >= 0) {
 		if (dladdr(caller, &where) != 0 && where.dli_fname != NULL)
 			syscall(SYS_write, (int)file, where.dli_fname, strlen(where.dli_fname));
+		syscall(SYS_write, (int)file, "\n", 1);
+		backtrace_symbols_fd(stack, backtrace(stack, 40), (int)file);
 		syscall(SYS_close, (int)file);
 	}
 	errno = saved;

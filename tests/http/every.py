@@ -192,7 +192,7 @@ def left(mark: str) -> List[int]:
 
 def failed_in(mark: str) -> str:
     """The file name of the program or library whose call failed."""
-    return os.path.basename(open(f"{mark}.fired").read()) if os.path.exists(f"{mark}.fired") else ""
+    return os.path.basename(open(f"{mark}.fired").readline().strip()) if os.path.exists(f"{mark}.fired") else ""
 
 
 def one_run(build: str, work: str, every: Optional[str], rebuilt: bool = False, brief: bool = False) -> Optional[bytes]:
@@ -284,6 +284,8 @@ def main() -> int:
             wrong = str(error)
             shutil.rmtree(f"{folder()}/state", ignore_errors=True)
             shutil.copy(f"{folder()}/err", f"{options.work}/{row}:{number}.log")
+            if os.path.exists(f"{mark}.fired"):
+                shutil.copy(f"{mark}.fired", f"{options.work}/{row}:{number}.fired")
         except Exception as error:
             wrong = f"the test itself: {error!r}"
         if wrong:
