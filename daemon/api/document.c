@@ -298,20 +298,31 @@ static void add_agreement(cJSON *document, const struct recon_agreement *agreeme
 }
 
 /* How many are there, and how many of them the reconstruction has; null when the scan has gone. */
-static void add_views(cJSON *document, const struct scan_facts *scan, const struct job_record *record)
+static int add_views(cJSON *document, const struct scan_facts *scan, struct job *job, const struct job_record *record,
+		     struct error *err)
 {
+	struct job_views told;
 	cJSON *views;
-	int all;
+	int all, code;
 
 	if (scan == NULL) {
 		cJSON_AddNullToObject(document, "views");
-		return;
+		return 0;
 	}
+	code = job_views(job, &told, err);
+	if (code != 0)
+		return code;
 	all = scan->closed ? scan->received + scan->lost : scan->count;
 	views = cJSON_AddObjectToObject(document, "views");
 	cJSON_AddNumberToObject(views, "received", scan->received);
-	cJSON_AddNumberToObject(views, "reconstructed", record->state == JOB_SUCCEEDED ? all : record->reconstructed);
+	cJSON_AddNumberToObject(views, "reconstructed",
+				record->state == JOB_SUCCEEDED ? all - told.left_out : record->reconstructed);
 	cJSON_AddNumberToObject(views, "of", all);
+	if (told.told) {
+		cJSON_AddNumberToObject(views, "left_out", told.left_out);
+		cJSON_AddNumberToObject(views, "mended", told.mended);
+	}
+	return 0;
 }
 
 /* Adds the names of all that a job waits for before it can begin; an empty list for any other job. */
@@ -356,15 +367,16 @@ static void add_ran_on(cJSON *document, const char *text)
 		cJSON_AddItemToArray(list, cJSON_CreateNumber((double)strtol(at, &end, 10)));
 }
 
-static void add_job_facts(cJSON *document, struct job *job, const struct job_record *record)
+static int add_job_facts(cJSON *document, struct job *job, const struct job_record *record, struct error *err)
 {
 	bool works = record->state == JOB_RUNNING || record->attended;
 	struct scan_facts facts, *scan = NULL;
-	struct error err;
+	struct error gone;
+	int code;
 	int position = job_queue_position(job);
 	char href[64];
 
-	if (store_scan_look(jobs_store(job_jobs(job)), record->scan, &facts, &err) == 0)
+	if (store_scan_look(jobs_store(job_jobs(job)), record->scan, &facts, &gone) == 0)
 		scan = &facts;
 	snprintf(href, sizeof(href), "/v1/jobs/%s", record->id);
 	cJSON_AddStringToObject(document, "id", record->id);
@@ -375,7 +387,7 @@ static void add_job_facts(cJSON *document, struct job *job, const struct job_rec
 	cJSON_AddNumberToObject(document, "iterations", record->iterations);
 	cJSON_AddNumberToObject(document, "progress", record->fraction);
 	add_waiting_for(document, scan, record, job);
-	add_views(document, scan, record);
+	code = add_views(document, scan, job, record, err);
 	add_number_or_null(document, "eta_s", job_eta(job));
 	add_number_or_null(document, "start_s", job_start_in(job));
 	add_number_or_null(document, "queue_position", position > 0 ? position : -1);
@@ -404,6 +416,7 @@ static void add_job_facts(cJSON *document, struct job *job, const struct job_rec
 		json_add(document, "error", job_error_document(record));
 	else
 		cJSON_AddNullToObject(document, "error");
+	return code;
 }
 
 /* The members of the request, and where the world's axes point to in the patient. */
@@ -429,37 +442,7 @@ static void add_request(cJSON *document, const struct job *job, const struct job
 	cJSON_Delete(request);
 }
 
-static void add_to_number(cJSON *object, const char *name, int more)
-{
-	const cJSON *number = cJSON_GetObjectItemCaseSensitive(object, name);
-	const int now = cJSON_IsNumber(number) ? number->valueint : 0;
-
-	cJSON_DeleteItemFromObjectCaseSensitive(object, name);
-	cJSON_AddNumberToObject(object, name, now + more);
-}
-
-/* Projections that were left out are none of the reconstruction's. What a code told last holds: a job may begin anew.
- */
-static void count_views(cJSON *views, enum job_state state, const struct warning_record *warnings, int count)
-{
-	for (int i = 0; i < count; i++) {
-		char detail[WARNING_DETAIL_SIZE];
-		struct warning_views told;
-		bool last = true;
-
-		for (int later = i + 1; later < count; later++)
-			last = last && strcmp(warnings[later].code, warnings[i].code) != 0;
-		warning_parse(warnings[i].detail, detail, &told);
-		if (!last || told.count == 0)
-			continue;
-		add_to_number(views, "left_out", told.left_out);
-		add_to_number(views, "mended", told.mended);
-		if (state == JOB_SUCCEEDED)
-			add_to_number(views, "reconstructed", -told.left_out);
-	}
-}
-
-static int add_warnings(cJSON *document, struct store *store, enum job_state state, const char *id, struct error *err)
+static int add_warnings(cJSON *document, struct store *store, const char *id, struct error *err)
 {
 	struct warning_record *warnings;
 	int count, code = store_job_warnings(store, id, &warnings, &count, err);
@@ -470,8 +453,6 @@ static int add_warnings(cJSON *document, struct store *store, enum job_state sta
 	list = cJSON_AddArrayToObject(document, "warnings");
 	for (int i = 0; i < count; i++)
 		add_warning(list, warnings[i].code, warnings[i].detail);
-	if (cJSON_IsObject(cJSON_GetObjectItemCaseSensitive(document, "views")))
-		count_views(cJSON_GetObjectItemCaseSensitive(document, "views"), state, warnings, count);
 	free(warnings);
 	return 0;
 }
@@ -522,21 +503,21 @@ cJSON *job_document(struct job *job, bool brief, struct error *err)
 {
 	cJSON *document = cJSON_CreateObject();
 	struct job_record record;
-	int code = 0;
+	int code;
 
 	if (document == NULL) {
 		error_set(err, ERR_NO_MEMORY, "no memory for a job's document");
 		return NULL;
 	}
 	job_record(job, &record);
-	add_job_facts(document, job, &record);
+	code = add_job_facts(document, job, &record, err);
 	add_request(document, job, &record);
-	if (!brief) {
+	if (code == 0 && !brief) {
 		struct store *store = jobs_store(job_jobs(job));
 
 		code = add_volume_count(document, store, record.id, err);
 		if (code == 0)
-			code = add_warnings(document, store, record.state, record.id, err);
+			code = add_warnings(document, store, record.id, err);
 		if (code == 0)
 			code = add_sendings(document, job, err);
 		if (code == 0)

@@ -145,7 +145,7 @@ int job_list(void *context, struct request *request, struct error *err)
 	struct filter filter;
 	cJSON *document, *list;
 	struct page page;
-	int count;
+	int count, code = 0;
 	bool more;
 
 	if (page_read_ids(request, &page, err) != 0 || filter_read_jobs(request, &filter, err) != 0 ||
@@ -154,9 +154,18 @@ int job_list(void *context, struct request *request, struct error *err)
 	document = cJSON_CreateObject();
 	list = cJSON_AddArrayToObject(document, "jobs");
 	for (int i = 0; i < count; i++) {
-		cJSON_AddItemToArray(list, job_document(jobs[i], true, err));
+		cJSON *one = code == 0 ? job_document(jobs[i], true, err) : NULL;
+
+		if (one == NULL)
+			code = err->code;
+		else
+			cJSON_AddItemToArray(list, one);
 		job_facts(jobs[i], &last);
 		job_release(jobs[i]);
+	}
+	if (code != 0) {
+		cJSON_Delete(document);
+		return code;
 	}
 	if (more && count > 0)
 		cJSON_AddStringToObject(document, "next", last.id);

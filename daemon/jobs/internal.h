@@ -53,9 +53,11 @@ struct job {
 	double stage_since;            /* monotonic seconds, while running; 0 before this process saw it run */
 	double run_since;              /* monotonic seconds */
 	double run_fraction;           /* at run_since */
-	double rest, rest_at; /* what was told of the time left while it runs, and when, monotonic; 0: nothing yet */
-	double row_at;        /* monotonic seconds of the last history row, or of the last moment before the first */
-	double row_seconds;   /* smoothed time from row to row, 0 before the first */
+	double rest, rest_at;   /* what was told of the time left while it runs, and when, monotonic; 0: nothing yet */
+	double row_at;          /* monotonic seconds of the last history row, or of the last moment before the first */
+	double row_seconds;     /* smoothed time from row to row, 0 before the first */
+	struct job_views views; /* job_views; of when there had been so many changes of its warnings: */
+	unsigned views_of, warned;
 };
 
 /* Somebody who has posted jobs; there until the end. */
@@ -155,6 +157,8 @@ int job_wanted_sendings(const struct job *job, struct sending_record ret_sending
 
 /* Wakes those who watch the job or all jobs; no lock is held. */
 void job_wake(struct job *job);
+/* Its warnings have changed: job_views. */
+void job_forget_views(struct job *job);
 
 /* As job_set_state, with jobs->change held; the caller wakes the watchers after it. */
 int job_change_state(struct job *job, enum job_state to, const struct job_change *change, struct error *err);

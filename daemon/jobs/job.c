@@ -30,6 +30,7 @@ static struct job *job_new(struct jobs *jobs, struct job_record *record)
 	memcpy(job->id, record->id, sizeof(job->id));
 	memcpy(job->scan, record->scan, sizeof(job->scan));
 	job->references = 1;
+	job->warned = 1;
 	job->trial.where = &job->request.where;
 	job->trial.devices = &job->request.devices;
 	watch_list_init(&job->watchers);

@@ -326,6 +326,12 @@ int job_sync_volumes(struct job *job, struct error *err);
 /* See store_job_digest_volume. */
 int job_digest_volume(struct job *job, const struct volume_record *volume, struct error *err);
 int job_add_warning(struct job *job, const char *code, const char *detail, struct error *err);
+/* What its warnings say of projections; remembered until the next warning. Any thread. */
+struct job_views {
+	bool told; /* false: nothing, and the rest is 0 */
+	int left_out, mended;
+};
+int job_views(struct job *job, struct job_views *ret, struct error *err);
 
 /* Until when the first of the jobs stays that are kept for other hosts just now, CLOCK_MONOTONIC; 0: none is. */
 double jobs_kept_away(struct jobs *jobs);

@@ -280,8 +280,10 @@ int job_change_state(struct job *job, enum job_state to, const struct job_change
 	if (code != 0)
 		return code;
 	show_state(job, &record, change);
-	if (past == PAST_GOES)
+	if (past == PAST_GOES) {
+		job_forget_views(job);
 		store_job_remove_volumes(job->jobs->store, record.id);
+	}
 	if (job_state_ended(to)) {
 		store_job_tidy(job->jobs->store, record.id);
 		/* Where the rows cannot be read it counts for what it might have kept. */

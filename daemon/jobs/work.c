@@ -3,8 +3,10 @@
 #include <stddef.h>
 #include <stdio.h>
 #include <stdlib.h>
+#include <string.h>
 #include <unistd.h>
 
+#include "core/warning.h"
 #include "daemon/jobs/document.h"
 #include "daemon/jobs/internal.h"
 #include "daemon/log.h"
@@ -541,7 +543,62 @@ int job_add_warning(struct job *job, const char *code_name, const char *detail, 
 		return code;
 	code = store_job_add_warning(job->jobs->store, job->id, &warning, &event, &new, err);
 	free(event.data);
-	if (code == 0 && new)
+	if (code == 0 && new) {
+		job_forget_views(job);
 		job_wake(job);
+	}
 	return code;
+}
+
+void job_forget_views(struct job *job)
+{
+	pthread_mutex_lock(&job->jobs->lock);
+	job->warned++;
+	pthread_mutex_unlock(&job->jobs->lock);
+}
+
+/* What a code told last holds: a job may begin anew. */
+static void count_views(const struct warning_record *warnings, int count, struct job_views *ret)
+{
+	*ret = (struct job_views){.told = false};
+	for (int i = 0; i < count; i++) {
+		char detail[WARNING_DETAIL_SIZE];
+		struct warning_views views;
+		bool last = true;
+
+		for (int later = i + 1; later < count; later++)
+			last = last && strcmp(warnings[later].code, warnings[i].code) != 0;
+		warning_parse(warnings[i].detail, detail, &views);
+		if (!last || views.count == 0)
+			continue;
+		ret->told = true;
+		ret->left_out += views.left_out;
+		ret->mended += views.mended;
+	}
+}
+
+int job_views(struct job *job, struct job_views *ret, struct error *err)
+{
+	struct warning_record *warnings;
+	unsigned warned;
+	bool known;
+	int count, code;
+
+	pthread_mutex_lock(&job->jobs->lock);
+	warned = job->warned;
+	known = job->views_of == warned;
+	*ret = job->views;
+	pthread_mutex_unlock(&job->jobs->lock);
+	if (known)
+		return 0;
+	code = store_job_warnings(job->jobs->store, job->id, &warnings, &count, err);
+	if (code != 0)
+		return code;
+	count_views(warnings, count, ret);
+	free(warnings);
+	pthread_mutex_lock(&job->jobs->lock);
+	job->views = *ret;
+	job->views_of = warned;
+	pthread_mutex_unlock(&job->jobs->lock);
+	return 0;
 }

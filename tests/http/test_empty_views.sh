@@ -71,6 +71,8 @@ test_views_that_show_nothing_are_told_and_left_out() {
 	expect_json '.warnings | all(.code != "no_object")'
 	expect_json '[.warnings[] | select(.code == "blank_views") | .views, .view_count, .left_out, .mended] == [[[7, 8], [30, 30], [52, 52]], 4, 4, 0]'
 	expect_json '.views == {received: 60, reconstructed: 56, of: 60, left_out: 4, mended: 0}'
+	req GET "/v1/jobs?scan=$scan"
+	expect_json '[.jobs[].views] == [{received: 60, reconstructed: 56, of: 60, left_out: 4, mended: 0}]'
 	get_volume final "$work/empty.nii"
 	# What four views of 60 take away; 40 HU where they are believed.
 	expect_number "$(cbct compare --json "$work/empty.nii" "$work/good.nii" | jq '.rmse / 0.0192 * 1000')" '<' 12 "RMSE in HU"
