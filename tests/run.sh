@@ -106,7 +106,10 @@ run_part() { # PART
 		;;
 	esac
 	[ -s "$RESULTS" ] || echo "fail $1: it has no result" >"$RESULTS"
-	echo "-- $((SECONDS - started)) s"
+	# The last line is what all processes of this part used that were waited for: in the program, in the kernel. It is not
+	# piped, since the shell of a pipe has none.
+	times >"$out/$name.times"
+	echo "-- $((SECONDS - started)) s, of processors $(tail -1 "$out/$name.times")"
 }
 
 # JOBS parts at a time. A part's output is shown in one piece when it has ended. Each is a process group of its own (-m),

@@ -413,13 +413,15 @@ test_what_is_old_goes_unless_it_is_pinned() {
 	expect_json '.pinned and .client == "a"'
 	ask GET "/v1/jobs/$pinned"
 	expect_json '.pinned and .client == "a"'
+	for _ in 1 2; do # once more is no mistake; this daemon removes nothing
+		ask DELETE "/v1/scans/$complete/pin"
+		expect_status 204
+	done
 	stop_daemon
 	start_daemon --tokens "$work/tokens" --keep 1
 	ask PUT "/v1/scans/$open/pin"
 	expect_status 204
 	cbct unpin "$open"
-	ask DELETE "/v1/scans/$open/pin"
-	expect_status 204
 	ask DELETE "/v1/jobs/$pinned/pin"
 	expect_status 204
 	gone "/v1/scans/$open"

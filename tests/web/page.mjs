@@ -766,7 +766,8 @@ test('metal has its own colour in 3D, which starts from behind then; the quality
 		for (let i = 0; i < 4; i++)
 			await page.keyboard.press('ArrowLeft')
 		expect(await edges(page, '3d') === render, `${what}: ${render} about the rendering, got ${await edges(page, '3d')}`)
-		const { quality } = (await api(`/v1/jobs/${job.id}/volumes`)).volumes.at(-1), said = await page.textContent('p.quality')
+		const { quality } = (await api(`/v1/jobs/${job.id}/volumes`)).volumes.at(-1)
+		const said = await until('the quality is said', () => page.textContent('p.quality'), text => text !== '')
 		for (const [pattern, value] of [[/noise ([\d.]+) HU/, quality.noise_hu], [/edges ([\d.]+) mm wide/, quality.edge_mm], [/([\d.]+) % of it metal/, quality.metal_share > 0 ? 100 * quality.metal_share : null]]) {
 			const number = said.match(pattern)?.[1]
 			expect(value === null ? number === undefined : Math.abs(Number(number) - value) <= 0.06 * value, `${what}: ${value} said by ${pattern}, got: ${said}`)
@@ -1023,6 +1024,7 @@ test('everything by keyboard, the focus visible', async () => {
 	expect(String(await windowOf(page)) === '400,40', 'soft tissue')
 	await page.keyboard.press('Shift+ArrowRight')
 	expect((await windowOf(page))[0] === 420, 'a wider window')
+	await planePixels(page, 'x') /* a plane out of sight is not drawn when its voxels come */
 	await page.keyboard.press('m')
 	expect(await page.getAttribute('.viewer', 'data-tile') === 'z', 'the axial plane alone')
 	const behind = await planePixels(page, 'x')
