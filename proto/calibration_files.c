@@ -41,6 +41,17 @@ int sealed_write(const char *path, const cJSON *document, struct error *err)
 	return code;
 }
 
+int unsealed_write(const char *path, const cJSON *document, struct error *err)
+{
+	size_t length = 0;
+	char *text = json_print(document, &length);
+	int code = text == NULL ? error_set(err, ERR_NO_MEMORY, "no memory for %s", path)
+				: file_write_durable(path, text, length, err);
+
+	free(text);
+	return code;
+}
+
 /* The content of an open file that fits its seal. */
 static int read_content(int file, const char *path, char **ret_text, size_t *ret_length, struct error *err)
 {
@@ -182,10 +193,14 @@ static int read_views(const cJSON *result, struct calibrated *calibrated, struct
 
 static int read_balls(const cJSON *result, struct calibrated *calibrated, struct error *err)
 {
-	cJSON *phantom = cJSON_CreateObject();
+	const cJSON *balls = cJSON_GetObjectItemCaseSensitive(result, "balls_mm");
+	cJSON *phantom;
 	int code;
 
-	json_add(phantom, "balls_mm", cJSON_Duplicate(cJSON_GetObjectItemCaseSensitive(result, "balls_mm"), true));
+	if (!cJSON_IsArray(balls))
+		return 0;
+	phantom = cJSON_CreateObject();
+	json_add(phantom, "balls_mm", cJSON_Duplicate(balls, true));
 	code = balls_read(phantom, &calibrated->balls, err);
 	cJSON_Delete(phantom);
 	return code;

@@ -11,6 +11,9 @@
  *   result.json   {"ended", "error": null} and the members of calibration_json; or
  *                 {"ended", "error": {"code": enum error_code, "detail", "pointer"}}: written by cbct-worker
  *
+ * Of a calibration that a job has refined (proto/refinement.h) the request has "job" in place of the phantom,
+ * and the result "geometry" alone: the daemon writes both.
+ *
  * Request and result end with their checksums (proto/seal.h). A directory without a result is a calibration that is
  * still to be made.
  */
@@ -19,6 +22,8 @@
 
 /* Whole or not at all, as file_write_durable. */
 int sealed_write(const char *path, const cJSON *document, struct error *err);
+/* The same without checksums. */
+int unsealed_write(const char *path, const cJSON *document, struct error *err);
 /* ERR_NOT_FOUND where there is no file, ERR_DAMAGED where it does not fit its checksums. Free with cJSON_Delete. */
 int sealed_read(const char *path, cJSON **ret_document, struct error *err);
 
@@ -33,7 +38,7 @@ struct calibrated {
 	struct scan *sweep; /* the scan of the phantom: nominal geometry, detector */
 	double acquired;    /* when that scan was made, seconds since 1970 */
 	struct geometry geometry;
-	struct balls balls;
+	struct balls balls; /* none: a job has refined it, and there was no phantom */
 };
 int calibrated_read(const cJSON *request, const cJSON *result, struct calibrated *ret, struct error *err);
 void calibrated_clear(struct calibrated *calibrated);

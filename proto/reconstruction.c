@@ -23,10 +23,12 @@
 #include "core/correct/stuck.h"
 #include "core/pulse.h"
 #include "core/scan/crop.h"
+#include "proto/calibration_files.h"
 #include "proto/checkpoint.h"
 #include "proto/durable.h"
 #include "proto/format.h"
 #include "proto/nifti.h"
+#include "proto/refinement.h"
 #include "proto/saver.h"
 #include "proto/seal.h"
 #include "proto/sums.h"
@@ -809,45 +811,49 @@ static int heed_pixels(struct reconstruction *reconstruction, bool *ret_again, s
 	return open_again(reconstruction, err);
 }
 
-/* Says what was changed, the mean and the most over the views: mm and degrees. */
-static void tell_refinement(struct reconstruction *reconstruction, const struct refinement *refinement)
+static int write_refined(const struct reconstruction *reconstruction, const struct refined *refined, struct error *err)
 {
-	const bool motion = reconstruction->options->recipe->refine.motion;
-	const struct path *path = &refinement->path;
-	double squares[2] = {0}, most[2] = {0};
-	enum { PLACES = 256 };
+	cJSON *document = refined_json(refined);
+	char path[1200];
+	int code = document == NULL
+		       ? error_set(err, ERR_NO_MEMORY, "no memory for what was refined")
+		       : path_join(path, sizeof(path), reconstruction->run.directory, REFINEMENT_FILE, "", err);
+
+	if (code == 0)
+		code = reconstruction->run.sealed ? sealed_write(path, document, err)
+						  : unsealed_write(path, document, err);
+	cJSON_Delete(document);
+	return code;
+}
+
+/* What was changed stands in a file of the job before it is told. */
+static int tell_refinement(struct reconstruction *reconstruction, const struct refinement *refinement,
+			   struct error *err)
+{
+	const struct geometry *whole = &reconstruction->files.scan->geometry;
+	const enum refine_kind kind = reconstruction->options->recipe->refine.motion ? REFINE_MOTION : REFINE_GEOMETRY;
+	struct refined refined;
 	char detail[400];
+	const char *warning;
+	int code = refined_open(&refined, refinement, kind, whole->count, err);
 
-	for (int i = 0; i < PLACES; i++) {
-		double numbers[PATH_NUMBERS], size[2];
+	if (code < 0)
+		return code;
+	for (int k = 0; k < refined.count; k++) {
+		double motion[PATH_NUMBERS];
 
-		path_at(path, path->length * i / (PLACES - 1), numbers);
-		size[0] = vec_norm(numbers);
-		size[1] = vec_norm(numbers + 3) * PATH_TURN_UNIT * 180 / M_PI;
-		for (int k = 0; k < 2; k++) {
-			squares[k] += size[k] * size[k] / PLACES;
-			most[k] = fmax(most[k], size[k]);
-		}
+		recon_motion(reconstruction->recon, refinement, k, motion);
+		refine_change(kind, &whole->views[k], motion, refined.change[k]);
+		refined.views[k] = view_of_moved(&whole->views[k], motion);
+		refined.projections[k] = projection_of(reconstruction, k);
 	}
-	if (refinement->accepted)
-		snprintf(
-		    detail, sizeof(detail),
-		    "%s by %.2g mm and %.2g degrees (root mean square over the sweep; at most %.2g mm and %.2g "
-		    "degrees); %d of %d views that were held out agree better, what is unexplained of their detail "
-		    "fell by %.0f %%",
-		    motion ? "the object moved" : "views were moved", sqrt(squares[0]), sqrt(squares[1]), most[0],
-		    most[1], refinement->better, refinement->held_out,
-		    100 * (1 - refinement->held_after / refinement->held_before));
-	else
-		snprintf(detail, sizeof(detail),
-			 refinement->held_out > 0 ? "%d views that were held out do not agree better with any other"
-						  : "%d views could be held out: too few views, pixels or degrees",
-			 refinement->held_out);
-	run_warning(&reconstruction->run,
-		    !refinement->accepted ? "not_refined"
-		    : motion              ? "motion_followed"
-					  : "geometry_refined",
-		    detail);
+	refined_measure(&refined);
+	code = write_refined(reconstruction, &refined, err);
+	warning = refined_tell(&refined, detail, sizeof(detail));
+	if (code == 0 && !reconstruction->resumed)
+		run_warning(&reconstruction->run, warning, detail);
+	refined_clear(&refined);
+	return code;
 }
 
 /*
@@ -867,9 +873,8 @@ static int heed_poses(struct reconstruction *reconstruction, bool *ret_again, st
 		return code;
 	reconstruction->refined = true;
 	*ret_again = refinement.accepted || reconstruction->resumed;
-	if (!reconstruction->resumed)
-		tell_refinement(reconstruction, &refinement);
-	return *ret_again ? open_again(reconstruction, err) : 0;
+	code = tell_refinement(reconstruction, &refinement, err);
+	return code == 0 && *ret_again ? open_again(reconstruction, err) : code;
 }
 
 /*

@@ -23,6 +23,7 @@ static const struct command *const commands[] = {
     &command_token,         &command_audit,   &command_calibrate_scan,  &command_calibrations, &command_doctor,
     &command_backup,        &command_restore, &command_reproduce,       &command_send,         &command_destinations,
     &command_fit_hardening, &command_fit_lag, &command_fit_scatter,     &command_worklist,     &command_remote,
+    &command_refinement,
 };
 enum { COMMAND_COUNT = sizeof(commands) / sizeof(commands[0]) };
 

@@ -4,8 +4,10 @@
 #include <string.h>
 
 #include "clients/cbct/remote_internal.h"
+#include "proto/calibration_files.h"
 #include "proto/clock.h"
 #include "proto/json.h"
+#include "proto/refinement.h"
 
 static const double LOOK = 0.1; /* s between two looks at the job there */
 
@@ -44,6 +46,29 @@ static int tell_rows(struct remote *remote, const cJSON *job, struct error *err)
 	return 0;
 }
 
+/* What was refined there is here before it is told. */
+static int fetch_refinement(struct remote *remote, struct error *err)
+{
+	cJSON *document = NULL;
+	char path[1200];
+	int code;
+
+	snprintf(path, sizeof(path), "/v1/jobs/%.63s/refinement", remote->job);
+	code = remote_ask(remote, "GET", path, &document, err);
+	if (code == 0)
+		code = path_join(path, sizeof(path), remote->start->job_directory, REFINEMENT_FILE, "", err);
+	if (code == 0)
+		code = sealed_write(path, document, err);
+	cJSON_Delete(document);
+	return code;
+}
+
+static bool tells_of_refinement(const char *code)
+{
+	return strcmp(code, "geometry_refined") == 0 || strcmp(code, "motion_followed") == 0 ||
+	       strcmp(code, "not_refined") == 0;
+}
+
 static int tell_warnings(struct remote *remote, const cJSON *job, struct error *err)
 {
 	const cJSON *warnings = cJSON_GetObjectItemCaseSensitive(job, "warnings"), *warning;
@@ -57,7 +82,10 @@ static int tell_warnings(struct remote *remote, const cJSON *job, struct error *
 			continue;
 		snprintf(message.code_name, sizeof(message.code_name), "%s", member_text(warning, "code", ""));
 		snprintf(message.text, sizeof(message.text), "%s", member_text(warning, "detail", ""));
-		code = remote_tell(remote, &message, err);
+		if (tells_of_refinement(message.code_name))
+			code = fetch_refinement(remote, err);
+		if (code == 0)
+			code = remote_tell(remote, &message, err);
 		if (code != 0)
 			return code;
 		remote->warnings = index;

@@ -561,6 +561,11 @@ class Client:
             raise CalibrationFailed(document)
         return document
 
+    def keep_refinement(self, job: str, *, arm: Optional[str] = None) -> Document:
+        """Keeps the geometry that a job has refined as a calibration for other scans of the arm; gives its document."""
+        request: Document = {"job": job} if arm is None else {"job": job, "arm": arm}
+        return self._json("POST", "/v1/calibrations", json=request, repeatable=False)
+
     def calibration(self, calibration: str) -> Document:
         """The calibration's document."""
         return self._json("GET", f"/v1/calibrations/{calibration}")
@@ -720,6 +725,10 @@ class Client:
     def provenance(self, job: str, name: str = "final") -> Document:
         """What a kept volume was made from: digests of scan and projections, recipe, program, device."""
         return self._json("GET", f"/v1/jobs/{job}/volumes/{name}/provenance")
+
+    def refinement(self, job: str) -> Document:
+        """What a job with ``"refine"`` has changed in each view, mm and degrees, and the geometry that was found."""
+        return self._json("GET", f"/v1/jobs/{job}/refinement")
 
     def annotations(self, job: str) -> Tuple[Document, str]:
         """What was measured in the job's volumes, and the tag that a change of it names."""

@@ -323,8 +323,14 @@ int recon_push(struct recon *recon, const void *samples, const int *views, int c
 	return 0;
 }
 
-/* The detector's own views, moved as the path says of those that all goes by. */
-static int move_views(const struct recon *recon, const struct path *path, struct geometry *ret_geometry,
+void recon_motion(const struct recon *recon, const struct refinement *refinement, int view,
+		  double ret_motion[PATH_NUMBERS])
+{
+	path_motion(&refinement->path, refine_place(&recon->orbit, view), &recon->geometry->views[view], ret_motion);
+}
+
+/* The detector's own views, moved as those are that all goes by. */
+static int move_views(const struct recon *recon, const struct refinement *refinement, struct geometry *ret_geometry,
 		      struct error *err)
 {
 	int code = geometry_copy(ret_geometry, recon->given, err);
@@ -332,7 +338,7 @@ static int move_views(const struct recon *recon, const struct path *path, struct
 	for (int k = 0; k < recon->geometry->count && code == 0; k++) {
 		double motion[PATH_NUMBERS];
 
-		path_motion(path, refine_place(&recon->orbit, k), &recon->geometry->views[k], motion);
+		recon_motion(recon, refinement, k, motion);
 		ret_geometry->views[k] = view_of_moved(&recon->given->views[k], motion);
 	}
 	return code;
@@ -363,7 +369,7 @@ int recon_refine(struct recon *recon, struct refinement *ret_refinement, struct 
 				     &watch, &refinement, err);
 	recon->work_done = recon->refine_from + recon->refine_work;
 	if (code == 0 && refinement.accepted)
-		code = move_views(recon, &refinement.path, ret_geometry, err);
+		code = move_views(recon, &refinement, ret_geometry, err);
 	if (code == 0)
 		*ret_refinement = refinement;
 	return code;

@@ -129,6 +129,9 @@ int recon_push(struct recon *recon, const void *samples, const int *views, int c
  */
 int recon_refine(struct recon *recon, struct refinement *ret_refinement, struct geometry *ret_geometry,
 		 struct error *err);
+/* The motion that it has found for a view: as path_motion. */
+void recon_motion(const struct recon *recon, const struct refinement *refinement, int view,
+		  double ret_motion[PATH_NUMBERS]);
 
 /*
  * After the last view, before recon_run: whether there are spoiled views which could be made whole, or left out, if all

@@ -55,6 +55,26 @@ double refine_place(const struct orbit *orbit, int view)
 	return turn < -1e-9 ? turn + 2 * PI : fmax(0, turn);
 }
 
+void refine_change(enum refine_kind kind, const struct view *view, const double motion[PATH_NUMBERS],
+		   double ret_change[PATH_NUMBERS])
+{
+	/* What moves with the arm and stood at the isocentre. */
+	const struct view origin = {.source = {0}}, moved = view_of_moved(&origin, motion);
+	double axes[3][3];
+
+	if (kind == REFINE_MOTION) {
+		memcpy(ret_change, motion, PATH_NUMBERS * sizeof(*ret_change));
+	} else {
+		view_axes(view, axes);
+		for (int a = 0; a < 3; a++) {
+			ret_change[a] = vec_dot(axes[a], moved.source);
+			ret_change[3 + a] = -vec_dot(axes[a], motion + 3);
+		}
+	}
+	for (int a = 3; a < PATH_NUMBERS; a++)
+		ret_change[a] *= 180 / PI;
+}
+
 /* ---- levels ---- */
 
 /* The last level has the bins that are there, the first one those of twice their size, where they are many enough. */

@@ -48,6 +48,13 @@ struct refinement {
 bool refine_is_possible(const struct geometry *geometry, const struct orbit *orbit);
 /* Where a view stands on the path, radians from the first of the sweep on. */
 double refine_place(const struct orbit *orbit, int view);
+/*
+ * What a motion of the object, as path_motion has it, is for people: mm, and a vector of rotation in degrees about the
+ * isocentre. Of a geometry how source and detector of `view` were moved as one body, along and about its columns, its
+ * rows and across both; of a motion the object's along and about x, y and z.
+ */
+void refine_change(enum refine_kind kind, const struct view *view, const double motion[PATH_NUMBERS],
+		   double ret_change[PATH_NUMBERS]);
 /* Bytes of the host's memory that refine_find takes: it works on the CPU's backend. */
 int refine_bytes(const struct reduced *reduced, size_t *ret_bytes, struct error *err);
 /* What it takes, in updates of a voxel by a view as FDK makes them. */

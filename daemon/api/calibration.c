@@ -4,6 +4,23 @@
 #include <string.h>
 
 #include "daemon/api/internal.h"
+#include "proto/json.h"
+
+/* A body with a job keeps what that has refined; any other one is of a phantom's scan. */
+static int post(struct api *api, const char *client, const char *text, size_t length, char ret_id[ID_SIZE],
+		struct error *err)
+{
+	cJSON *body = NULL;
+	int code = json_parse(text, length, &body, err);
+
+	if (code != 0)
+		return code;
+	code = cJSON_GetObjectItemCaseSensitive(body, "job") != NULL
+		   ? refinement_keep(api, client, body, ret_id, err)
+		   : calibrations_post(api->calibrations, client, body, length, ret_id, err);
+	cJSON_Delete(body);
+	return code;
+}
 
 int calibration_post(void *context, struct request *request, struct error *err)
 {
@@ -14,7 +31,7 @@ int calibration_post(void *context, struct request *request, struct error *err)
 	const char *text = request_body(request, &length);
 
 	request_client(request, client);
-	if (calibrations_post(api->calibrations, client, text, length, id, err) != 0 ||
+	if (post(api, client, text, length, id, err) != 0 ||
 	    calibration_document(api->calibrations, id, false, &document, NULL, err) != 0 ||
 	    request_reply_json(request, 202, document, err) != 0)
 		return err->code;

@@ -297,6 +297,18 @@ static void add_agreement(cJSON *document, const struct recon_agreement *agreeme
 	cJSON_AddNumberToObject(object, "views", agreement->views);
 }
 
+/* Where what was refined stands; null where the job is not to refine anything. */
+static void add_refinement(cJSON *document, const struct job *job, const char *id)
+{
+	const struct job_request *asked;
+	struct error ignored;
+	char href[80] = "";
+
+	if (job_request(job, &asked, &ignored) == 0 && (asked->recipe.refine.geometry || asked->recipe.refine.motion))
+		snprintf(href, sizeof(href), "/v1/jobs/%s/refinement", id);
+	add_text_or_null(document, "refinement", href);
+}
+
 /* How many are there, and how many of them the reconstruction has; null when the scan has gone. */
 static int add_views(cJSON *document, const struct scan_facts *scan, struct job *job, const struct job_record *record,
 		     struct error *err)
@@ -398,6 +410,7 @@ static int add_job_facts(cJSON *document, struct job *job, const struct job_reco
 	add_memory(document, &record->memory);
 	add_denoising(document, record);
 	add_agreement(document, &record->agreement);
+	add_refinement(document, job, record->id);
 	if (record->stop.rule != STOP_NOT)
 		json_add(document, "stopped", stop_document(&record->stop));
 	else

@@ -15,7 +15,8 @@
  * The directories are all that there is: the catalogue knows nothing of calibrations, and at the start they are read,
  * each file held against its checksums. One that is damaged is set aside in quarantine/. A calibration without a result
  * is made, again after a restart, by `cbct-worker --calibrate`, one at a time. A scan that uses a calibration has a
- * copy of its matrices, so that deleting it harms nothing.
+ * copy of its matrices, so that deleting it harms nothing. One that a job has refined out of a scan of whatever it may
+ * be (proto/refinement.h) is kept beside them: it has no phantom, and its result from the beginning.
  *
  * Threads: any, but calibrations_open and calibrations_close once each.
  */
@@ -33,11 +34,22 @@ int calibrations_open(struct store *store, const struct calibrations_options *op
 void calibrations_close(struct calibrations *calibrations);
 
 /*
- * Reads the body of POST /v1/calibrations and takes it up; on the disk when this returns. ERR_NOT_FOUND: no such scan;
- * ERR_CONFLICT: the scan lacks projections or air; ERR_INVALID, ERR_IMPOSSIBLE: the phantom;
- * ERR_LIMIT, ERR_BUSY, ERR_QUOTA: a limit of jobs, among which it counts, or of bytes.
+ * Reads the body of POST /v1/calibrations, of so many bytes, and takes it up; on the disk when this returns.
+ * ERR_NOT_FOUND: no such scan; ERR_CONFLICT: the scan lacks projections or air; ERR_INVALID, ERR_IMPOSSIBLE: the
+ * phantom; ERR_LIMIT, ERR_BUSY, ERR_QUOTA: a limit of jobs, among which it counts, or of bytes.
  */
-int calibrations_post(struct calibrations *calibrations, const char *client, const char *text, size_t length,
+int calibrations_post(struct calibrations *calibrations, const char *client, const cJSON *body, size_t length,
+		      char ret_id[ID_SIZE], struct error *err);
+/* What a job has refined, to be kept as a calibration. */
+struct calibration_kept {
+	const char *job, *scan, *arm; /* ids; arm "" for none */
+	const cJSON *refinement;      /* proto/refinement.h */
+};
+/*
+ * Takes it up as one that has succeeded, on the disk when this returns. ERR_CONFLICT: the scan has gone, or views of it
+ * were missing when the job ran; ERR_LIMIT, ERR_QUOTA: a limit of bytes.
+ */
+int calibrations_keep(struct calibrations *calibrations, const char *client, const struct calibration_kept *kept,
 		      char ret_id[ID_SIZE], struct error *err);
 /* Removes those that have failed before that time; others stay, since scans of months to come use them. */
 void calibrations_expire(struct calibrations *calibrations, double before);
@@ -66,7 +78,7 @@ int calibrations_find_views(void *context, const char *id, const struct scan *sc
 
 /*
  * A view of the phantom's scan with circles where the calibration has the balls, as PNG (free). ERR_NOT_FOUND: no such
- * calibration or view, or its scan is gone; ERR_CONFLICT: it has no result.
+ * calibration or view, its scan is gone, or it has no phantom; ERR_CONFLICT: it has no result.
  */
 int calibration_picture(struct calibrations *calibrations, const char *id, long view, char **ret_png,
 			size_t *ret_length, struct error *err);

@@ -117,7 +117,8 @@ static void add_warnings(cJSON *document, const cJSON *result)
 	cJSON *warnings = cJSON_AddArrayToObject(document, "warnings");
 	char detail[160];
 
-	if (result == NULL)
+	/* One that was kept of a job has no balls whose shadows could be told of. */
+	if (result == NULL || !cJSON_IsArray(cJSON_GetObjectItemCaseSensitive(result, "balls_mm")))
 		return;
 	add_scale_warning(warnings, result);
 	if (number_of(result, "other_turn_deg") != 0) {
@@ -151,6 +152,7 @@ cJSON *calibration_brief(const char *id, const cJSON *request, const cJSON *resu
 	add_copy(document, "client", request);
 	add_copy(document, "arm", request);
 	add_copy(document, "scan", request);
+	add_copy(document, "job", request);
 	json_add_time(document, "created", number_of(request, "created"));
 	json_add_time(document, "acquired", number_of(request, "acquired"));
 	json_add_time(document, "ended", number_of(result, "ended"));

@@ -381,8 +381,9 @@ static int add_scan(struct calibrations *calibrations, const char *id, cJSON *re
 	return code;
 }
 
-/* The directory under its name, with request.json, or nothing. */
-static int make_directory(struct calibrations *calibrations, const char *id, const cJSON *request, struct error *err)
+/* The directory under its name, with request.json and, where there is one, result.json; or nothing. */
+static int make_directory(struct calibrations *calibrations, const char *id, const cJSON *request, const cJSON *result,
+			  struct error *err)
 {
 	char name[ID_SIZE + 8], beside[1024], path[1024], parent[1024];
 	int code;
@@ -396,6 +397,9 @@ static int make_directory(struct calibrations *calibrations, const char *id, con
 		return code;
 	calibration_path(calibrations, name, CALIBRATION_REQUEST, path);
 	code = sealed_write(path, request, err);
+	calibration_path(calibrations, name, CALIBRATION_RESULT, path);
+	if (code == 0 && result != NULL)
+		code = sealed_write(path, result, err);
 	calibration_path(calibrations, id, "", path);
 	if (code == 0 && rename(beside, path) != 0)
 		code = error_set_errno(err, errno, "rename of %s", beside);
@@ -410,39 +414,106 @@ static int make_directory(struct calibrations *calibrations, const char *id, con
 	return code;
 }
 
-int calibrations_post(struct calibrations *calibrations, const char *client, const char *text, size_t length,
-		      char ret_id[ID_SIZE], struct error *err)
+/* Within the client's limits it gets an id, its directory and its place in the list. */
+static int take_up(struct calibrations *calibrations, const char *client, size_t bytes, const cJSON *request,
+		   const cJSON *result, char ret_id[ID_SIZE], struct error *err)
 {
-	cJSON *body = NULL, *request = cJSON_CreateObject();
-	char scan[64] = "", id[ID_SIZE];
+	char id[ID_SIZE];
 	struct entry entry;
-	int code = json_parse(text, length, &body, err);
+	int code = store_check_bytes(calibrations->store, client, bytes, err);
 
 	if (code == 0)
-		code = read_body(body, scan, request, err);
+		code = id_make(id, err);
+	if (code == 0)
+		code = make_directory(calibrations, id, request, result, err);
+	if (code == 0)
+		code = calibration_load(calibrations, id, &entry, err);
+	if (code == 0)
+		code = insert(calibrations, &entry, err);
+	if (code != 0)
+		return code;
+	watch_wake(&calibrations->watchers);
+	memcpy(ret_id, id, sizeof(id));
+	return 0;
+}
+
+int calibrations_post(struct calibrations *calibrations, const char *client, const cJSON *body, size_t length,
+		      char ret_id[ID_SIZE], struct error *err)
+{
+	cJSON *request = cJSON_CreateObject();
+	char scan[64] = "";
+	int code = read_body(body, scan, request, err);
+
 	if (code == 0)
 		code = add_scan(calibrations, scan, request, err);
 	cJSON_AddStringToObject(request, "client", client);
 	if (code == 0)
 		code = store_check_unended(calibrations->store, client, err);
 	if (code == 0)
-		code = store_check_bytes(calibrations->store, client, length, err);
-	if (code == 0)
-		code = id_make(id, err);
-	if (code == 0)
-		code = make_directory(calibrations, id, request, err);
-	if (code == 0)
-		code = calibration_load(calibrations, id, &entry, err);
-	if (code == 0)
-		code = insert(calibrations, &entry, err);
+		code = take_up(calibrations, client, length, request, NULL, ret_id, err);
 	cJSON_Delete(request);
-	cJSON_Delete(body);
+	if (code == 0)
+		calibrator_wake(calibrations);
+	return code;
+}
+
+/* Scan, sweep and times of a refinement; its geometry has all of the scan's views. */
+static int describe_kept(struct calibrations *calibrations, const struct calibration_kept *kept, cJSON *request,
+			 struct error *err)
+{
+	const cJSON *geometry = cJSON_GetObjectItemCaseSensitive(kept->refinement, "geometry");
+	const int views = cJSON_GetArraySize(cJSON_GetObjectItemCaseSensitive(geometry, "matrices"));
+	struct scan_facts facts;
+	struct stored_scan *scan;
+	int code = store_scan_find(calibrations->store, kept->scan, &scan, err);
+
+	if (code == ERR_NOT_FOUND)
+		return error_set_at(err, ERR_CONFLICT, "/job",
+				    "the scan %s of this job has been deleted: its sweep is not known any more",
+				    kept->scan);
 	if (code != 0)
 		return code;
-	calibrator_wake(calibrations);
-	watch_wake(&calibrations->watchers);
-	memcpy(ret_id, id, sizeof(id));
-	return 0;
+	stored_scan_facts(scan, &facts);
+	if (views != facts.count)
+		code = error_set_at(err, ERR_CONFLICT, "/job",
+				    "the job had %d of the scan's %d views, a calibration needs all of them", views,
+				    facts.count);
+	cJSON_AddStringToObject(request, "scan", kept->scan);
+	cJSON_AddStringToObject(request, "job", kept->job);
+	cJSON_AddBoolToObject(request, "adjust_balls", false);
+	if (kept->arm[0] != '\0')
+		cJSON_AddStringToObject(request, "arm", kept->arm);
+	else
+		cJSON_AddNullToObject(request, "arm");
+	cJSON_AddNumberToObject(request, "created", clock_realtime());
+	cJSON_AddNumberToObject(request, "acquired", facts.created);
+	json_add(request, "sweep", cJSON_Duplicate(stored_scan_parsed(scan)->document, true));
+	stored_scan_release(scan);
+	return code;
+}
+
+int calibrations_keep(struct calibrations *calibrations, const char *client, const struct calibration_kept *kept,
+		      char ret_id[ID_SIZE], struct error *err)
+{
+	const cJSON *geometry = cJSON_GetObjectItemCaseSensitive(kept->refinement, "geometry");
+	cJSON *request = cJSON_CreateObject(), *result = cJSON_CreateObject();
+	char *text = NULL;
+	size_t length = 0;
+	int code = describe_kept(calibrations, kept, request, err);
+
+	cJSON_AddStringToObject(request, "client", client);
+	cJSON_AddNumberToObject(result, "ended", clock_realtime());
+	cJSON_AddNullToObject(result, "error");
+	json_add(result, "geometry", cJSON_Duplicate(geometry, true));
+	if (code == 0) {
+		text = json_print(result, &length);
+		code = text == NULL ? error_set(err, ERR_NO_MEMORY, "no memory for a calibration")
+				    : take_up(calibrations, client, length, request, result, ret_id, err);
+	}
+	free(text);
+	cJSON_Delete(request);
+	cJSON_Delete(result);
+	return code;
 }
 
 /* ---- DELETE ---- */

@@ -123,7 +123,9 @@ int calibration_picture(struct calibrations *calibrations, const char *id, long 
 
 	if (code != 0)
 		return code;
-	if (view < 0 || view >= calibrated.sweep->count)
+	if (calibrated.balls.count == 0)
+		code = error_set(err, ERR_NOT_FOUND, "calibration %s is a job's: it has no phantom to be drawn", id);
+	else if (view < 0 || view >= calibrated.sweep->count)
 		code = error_set(err, ERR_NOT_FOUND, "view %ld is asked for, the calibration has 0 to %d", view,
 				 calibrated.sweep->count - 1);
 	if (code == 0) {

@@ -356,6 +356,13 @@ int job_sendings(struct job *job, struct sending_record **ret_sendings, int *ret
 int job_put_sendings(struct job *job, const struct sending_record *sendings, int count, const char *taken,
 		     struct error *err);
 
+/* ---- what the job has refined: jobs/refined.c ---- */
+/*
+ * The document of proto/refinement.h, the caller's to delete. ERR_NOT_FOUND: the job was not asked for it, or ended
+ * before; ERR_CONFLICT: it is not known yet; ERR_DAMAGED. Any thread.
+ */
+int job_refinement(struct job *job, cJSON **ret_document, struct error *err);
+
 /* ---- annotations: what people have measured in its volumes (proto/annotations.h) ---- */
 /* Another one for each text; quoted, for ETags. */
 enum { ANNOTATIONS_TAG_MAX = 36 };

@@ -20,16 +20,30 @@ told() { # CODE: the job tells it once, and no other one of these
 	expect_json "[.warnings[].code | select(IN(\"geometry_refined\", \"motion_followed\", \"not_refined\"))] == [\"$1\"]"
 }
 
+keep() { # JOB: what it has refined becomes a calibration
+	req POST /v1/calibrations -H 'Content-Type: application/json' -d "{\"job\": \"$1\", \"arm\": \"left\"}"
+}
 test_a_geometry_that_fits_stays() {
 	local plain
 	reconstruct "$work/fits" "$recipe"'"fdk": {}}'
-	expect_json '.refine == {"geometry": false, "motion": false}'
+	expect_json '.refine == {"geometry": false, "motion": false} and .refinement == null'
+	req GET "/v1/jobs/$job/refinement"
+	expect_problem 404
+	keep "$job"
+	expect_problem 422 /job
+	keep nothing
+	expect_problem 404 /job
 	plain=$(digest)
 	post_job "$recipe"'"fdk": {}, "refine": {"geometry": true}}'
 	wait_job succeeded
 	expect_json '.refine.geometry'
 	told not_refined
+	expect_json '.refinement == .href + "/refinement"'
 	[ "$(digest)" = "$plain" ] || fail "nothing was changed, and the volume is another one"
+	req GET "/v1/jobs/$job/refinement"
+	expect_json '.accepted == false and .views == [] and .geometry == null and .rms_mm == 0 and .held_out.views == 8'
+	keep "$job"
+	expect_problem 409 /job
 	req POST /v1/jobs -H 'Content-Type: application/json' \
 		-d "{\"scan\": \"$scan\", \"fdk\": {}, \"refine\": {\"geometry\": true, \"motion\": true}}"
 	expect_problem 422 /refine
@@ -53,6 +67,56 @@ test_an_arm_that_wanders_is_followed_and_gone_on_with() {
 	wait_job succeeded
 	told geometry_refined
 	[ "$(digest)" = "$first" ] || fail "the digest of the undisturbed run"
+}
+
+# rmse_of SCAN: error of its FDK volume against the head's truth
+rmse_of() {
+	reconstruct "$1" "${recipe/40, 32/40, 40}"'"fdk": {}}'
+	cbct get "$job" final -o "$work/head.nii" >/dev/null || fail "its volume"
+	cbct compare --json "$work/head.nii" "$work/head-truth.nii" | jq .rmse
+}
+
+# The same arm (the seed of its wander) takes another object, with fewer views, by the calibration that was kept.
+test_a_refined_geometry_is_kept_for_the_arm_s_next_scan() {
+	local head=(--phantom head --scale 85 --density 0.02 --arc 210 --columns 48 --rows 40 --pixel 8 --views 64)
+	local calibration nominal kept true
+	post_scan "$work/wanders"
+	post_projections "$work/wanders"
+	post_job "$recipe"'"fdk": {}, "refine": {"geometry": true}}'
+	wait_job succeeded
+	req GET "/v1/jobs/$job/refinement"
+	expect_json '.kind == "geometry" and .accepted and (.views | length) == 64 and (.geometry.matrices | length) == 64 and .rms_mm > 0.5 and
+		.most_mm >= .rms_mm and .held_out.better > 4 and (.views | map(.projection)) == [range(64)]'
+	keep "$job"
+	expect_status 202
+	calibration=$(jq -r .id "$body")
+	expect_json ".state == \"succeeded\" and .job == \"$job\" and .scan == \"$scan\" and .arm == \"left\" and .phantom == null and .balls_mm == null and .warnings == [] and
+		(.geometry.matrices | length) == 64 and .sweep.views == 64"
+	req GET "/v1/calibrations/$calibration/views/0"
+	expect_problem 404
+	cbct refinement "$job" >"$work/table" 2>"$work/said" || fail "$(cat "$work/said")"
+	[ "$(wc -l <"$work/table")" = 65 ] || fail "a line for each view: $(cat "$work/table")"
+	cbct refinement "$job" --keep --arm right >"$work/kept" || fail "what it has kept"
+	/usr/bin/python3 - "$url" "$job" <<-'END' || fail "what Python has asked for"
+		import sys
+		sys.path.insert(0, "clients/python")
+		import cbctd
+		url, job = sys.argv[1:]
+		with cbctd.Client(url) as client:
+		    assert client.refinement(job)["accepted"]
+		    kept = client.keep_refinement(job, arm="middle")
+		    assert kept["job"] == job and client.calibration(kept["id"])["geometry"] == client.refinement(job)["geometry"]
+	END
+	cbct calibrations | grep "^$(cat "$work/kept") .* right$" >/dev/null || fail "$(cbct calibrations)"
+
+	cbct simulate "${head[@]}" --wobble 3 --kind matrices --truth "$work/head-truth.nii" --grid 40 --spacing 4 -o "$work/head" >/dev/null
+	cbct simulate "${head[@]}" -o "$work/head-nominal" >/dev/null
+	true=$(rmse_of "$work/head")
+	cp "$work/head-nominal/scan.json" "$work/head/scan.json"
+	nominal=$(rmse_of "$work/head")
+	jq -c ".geometry = {kind: \"calibration\", id: \"$calibration\"}" "$work/head-nominal/scan.json" >"$work/head/scan.json"
+	kept=$(rmse_of "$work/head")
+	expect_number "$(jq -n "($kept - $true) / ($nominal - $true)")" '<' 0.5 "the share of the circle's error above the true views' that stays"
 }
 
 start_daemon

@@ -1,0 +1,109 @@
+/* What a refinement has changed, for people and as a document: refinement.h. */
+#include "proto/refinement.h"
+
+#include <math.h>
+#include <stdio.h>
+#include <stdlib.h>
+
+#include "proto/calibration.h"
+
+int refined_open(struct refined *ret_refined, const struct refinement *refinement, enum refine_kind kind, int count,
+		 struct error *err)
+{
+	struct refined refined = {.refinement = refinement, .kind = kind, .count = refinement->accepted ? count : 0};
+	const size_t views = (size_t)refined.count + 1;
+
+	refined.change = calloc(views, sizeof(*refined.change));
+	refined.projections = calloc(views, sizeof(*refined.projections));
+	refined.views = calloc(views, sizeof(*refined.views));
+	if (refined.change == NULL || refined.projections == NULL || refined.views == NULL) {
+		refined_clear(&refined);
+		return error_set(err, ERR_NO_MEMORY, "no memory for what was changed in %d views", count);
+	}
+	*ret_refined = refined;
+	return 0;
+}
+
+void refined_measure(struct refined *refined)
+{
+	double squares[2] = {0}, most[2] = {0};
+
+	for (int k = 0; k < refined->count; k++)
+		for (int i = 0; i < 2; i++) {
+			const double size = vec_norm(refined->change[k] + 3 * i);
+
+			squares[i] += size * size / refined->count;
+			most[i] = fmax(most[i], size);
+		}
+	for (int i = 0; i < 2; i++) {
+		refined->rms[i] = sqrt(squares[i]);
+		refined->most[i] = most[i];
+	}
+}
+
+void refined_clear(struct refined *refined)
+{
+	free(refined->change);
+	free(refined->projections);
+	free(refined->views);
+	*refined = (struct refined){0};
+}
+
+static void add_held_out(cJSON *json, const struct refinement *refinement)
+{
+	cJSON *held_out = cJSON_AddObjectToObject(json, "held_out");
+
+	cJSON_AddNumberToObject(held_out, "views", refinement->held_out);
+	cJSON_AddNumberToObject(held_out, "better", refinement->better);
+	cJSON_AddNumberToObject(held_out, "unexplained_before", refinement->held_before);
+	cJSON_AddNumberToObject(held_out, "unexplained_after", refinement->held_after);
+}
+
+cJSON *refined_json(const struct refined *refined)
+{
+	const struct refinement *refinement = refined->refinement;
+	cJSON *json = cJSON_CreateObject(), *list;
+
+	cJSON_AddStringToObject(json, "kind", refined->kind == REFINE_MOTION ? "motion" : "geometry");
+	cJSON_AddBoolToObject(json, "accepted", refinement->accepted);
+	add_held_out(json, refinement);
+	cJSON_AddNumberToObject(json, "rms_mm", refined->rms[0]);
+	cJSON_AddNumberToObject(json, "rms_deg", refined->rms[1]);
+	cJSON_AddNumberToObject(json, "most_mm", refined->most[0]);
+	cJSON_AddNumberToObject(json, "most_deg", refined->most[1]);
+	list = cJSON_AddArrayToObject(json, "views");
+	for (int k = 0; k < refined->count; k++) {
+		cJSON *view = cJSON_CreateObject();
+
+		cJSON_AddNumberToObject(view, "projection", refined->projections[k]);
+		json_add(view, "shift_mm", cJSON_CreateDoubleArray(refined->change[k], 3));
+		json_add(view, "turn_deg", cJSON_CreateDoubleArray(refined->change[k] + 3, 3));
+		cJSON_AddItemToArray(list, view);
+	}
+	if (refinement->accepted && refined->kind == REFINE_GEOMETRY)
+		json_add(json, "geometry", matrices_json(refined->views, refined->count));
+	else
+		cJSON_AddNullToObject(json, "geometry");
+	return json;
+}
+
+const char *refined_tell(const struct refined *refined, char *ret_detail, size_t size)
+{
+	const struct refinement *refinement = refined->refinement;
+	const bool motion = refined->kind == REFINE_MOTION;
+
+	if (!refinement->accepted) {
+		snprintf(ret_detail, size,
+			 refinement->held_out > 0 ? "%d views that were held out do not agree better with any other"
+						  : "%d views could be held out: too few views, pixels or degrees",
+			 refinement->held_out);
+		return "not_refined";
+	}
+	snprintf(ret_detail, size,
+		 "%s by %.2g mm and %.2g degrees (root mean square over the views; at most %.2g mm and %.2g degrees); "
+		 "%d of %d views that were held out agree better, what is unexplained of their detail fell by %.0f %%",
+		 motion ? "the object moved" : "views were moved", refined->rms[0], refined->rms[1], refined->most[0],
+		 refined->most[1], refinement->better, refinement->held_out,
+		 100 * (1 - refinement->held_after / refinement->held_before));
+	return motion ? "motion_followed" : "geometry_refined";
+}
