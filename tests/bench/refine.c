@@ -31,14 +31,17 @@ static const struct departure {
 	const char *name;
 	enum refine_kind kind;
 	double sag, jitter, nod, photons;
+	double aside; /* of the detector, along its columns: a share of its width */
 } departures[] = {
-    {"fits", REFINE_GEOMETRY, 0, 0, 0, 0},
-    {"fits, 20,000 photons", REFINE_GEOMETRY, 0, 0, 0, 2e4},
-    {"a tenth of the sag", REFINE_GEOMETRY, .1, 0, 0, 0},
-    {"the same, 20,000 photons", REFINE_GEOMETRY, .1, 0, 0, 2e4},
-    {"a third of the sag", REFINE_GEOMETRY, .3, 0, 0, 0},
-    {"still", REFINE_MOTION, 0, 0, 0, 2e4},
-    {"nod of 3 degrees, 3 mm", REFINE_MOTION, 0, 0, 3, 2e4},
+    {"fits", REFINE_GEOMETRY, 0, 0, 0, 0, 0},
+    {"fits, 20,000 photons", REFINE_GEOMETRY, 0, 0, 0, 2e4, 0},
+    {"a tenth of the sag", REFINE_GEOMETRY, .1, 0, 0, 0, 0},
+    {"the same, 20,000 photons", REFINE_GEOMETRY, .1, 0, 0, 2e4, 0},
+    {"a third of the sag", REFINE_GEOMETRY, .3, 0, 0, 0, 0},
+    {"still", REFINE_MOTION, 0, 0, 0, 2e4, 0},
+    {"nod of 3 degrees, 3 mm", REFINE_MOTION, 0, 0, 3, 2e4, 0},
+    {"fits, 2,000 photons", REFINE_GEOMETRY, 0, 0, 0, 2e3, 0},
+    {"fits, displaced detector", REFINE_GEOMETRY, 0, 0, 0, 2e4, .3},
 };
 enum { DEPARTURES = sizeof(departures) / sizeof(departures[0]) };
 
@@ -85,11 +88,17 @@ static int open_scan(struct scan *scan, const struct departure *departure, enum 
 		code = error_set(err, ERR_NO_MEMORY, "no memory for %d views", count);
 	if (code < 0)
 		return code;
+	for (int k = 0; k < count; k++)
+		for (int a = 0; a < 3; a++)
+			scan->said.views[k].pixel0[a] +=
+			    departure->aside * columns * scan->said.views[k].column_step[a];
 	make_body(&scan->body, kind, seed);
 	for (int k = 0; k < count; k++) {
 		double motion[PATH_NUMBERS];
 		struct view view = arm_view(&scan->arm, k);
 
+		for (int a = 0; a < 3; a++)
+			view.pixel0[a] += departure->aside * columns * view.column_step[a];
 		nod_at((double)k / count, departure->nod, motion);
 		scan->truth.views[k] = view_of_moved(&view, motion);
 		body_take(&scan->body, &scan->truth.views[k], columns, scan->arm.rows,
