@@ -182,7 +182,7 @@ $(BUILD)/cbct: $(call objects,$(cbct_sources)) $(library)
 $(BUILD)/cbct-worker-held: $(call objects,daemon/worker.c tests/http/held.c) $(library) $(cuda_objects)
 	$(call say,LINK)$(CC) $(LDFLAGS) -Wl,--wrap=fdatasync,--wrap=recon_push,--wrap=backend_find -o $@ $^ $(call pkg,--libs,$(proto_libs) $(core_libs)) $(if $(cuda_objects),$(cuda_libs)) $(LIBM)
 
-held_calls := live_get jobs_promote store_job_volumes job_digest_volume store_job_update store_job_add_volume store_job_digest_volume
+held_calls := live_get oblique_make jobs_promote store_job_volumes job_digest_volume store_job_update store_job_add_volume store_job_digest_volume
 # The order of locks is asserted in that daemon, and in the unit tests (tests/lock_order.c).
 lock_calls := lock_init pthread_mutex_lock pthread_mutex_unlock pthread_mutex_destroy pthread_cond_wait pthread_cond_timedwait
 $(BUILD)/cbctd-held: $(call objects,$(daemon_sources) tests/http/held.c tests/lock_order.c) $(BUILD)/proto/openapi.o $(BUILD)/web/assets.o $(library)

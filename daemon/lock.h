@@ -24,6 +24,7 @@ enum lock_rank {
 	LOCK_CALIBRATED, /* calibrations.lock */
 	LOCK_DIGESTS,    /* digester.lock */
 	LOCK_ENCODED,    /* encoded_copies.lock */
+	LOCK_PICTURES,   /* pictures.lock */
 	LOCK_SINK,       /* sink.lock */
 	LOCK_MAPPINGS,   /* mappings.lock */
 	LOCK_VERIFIED,   /* verified.lock */

@@ -257,6 +257,8 @@ static int start_parts(const struct config *config, struct api *api, struct erro
 	if (code == 0)
 		code = encoded_copies_new(api->store, STREAM_THREADS, &api->copies, err);
 	if (code == 0)
+		code = pictures_start(config->picture_patience, &api->pictures, err);
+	if (code == 0)
 		code = uploads_new(api->store, &uploads, &api->uploads, err);
 	if (code == 0)
 		code = cards_start(&api->cards, err);
@@ -281,6 +283,7 @@ static void stop_parts(struct api *api)
 	homes_free(api->homes);
 	cards_stop(api->cards);
 	uploads_free(api->uploads);
+	pictures_stop(api->pictures);
 	encoded_copies_free(api->copies);
 	mappings_free(api->mappings);
 	event_ring_free(api->events);

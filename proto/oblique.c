@@ -10,13 +10,19 @@ enum { TILE = 64 /* columns: what the layers of a tile's row have in common stay
 
 const char *const slab_mode_names[] = {"mean", "max", "min", NULL};
 
+/* By the largest component first: squares of small or large ones are 0 or infinite. */
 static bool normalise(const double from[3], double ret[3])
 {
-	double length = vec_norm(from);
+	double largest = fmax(fmax(fabs(from[0]), fabs(from[1])), fabs(from[2])), length;
 
+	if (!(largest > 0 && isfinite(largest)))
+		return false;
 	for (int i = 0; i < 3; i++)
-		ret[i] = from[i] / length;
-	return length > 0 && isfinite(length);
+		ret[i] = from[i] / largest;
+	length = vec_norm(ret);
+	for (int i = 0; i < 3; i++)
+		ret[i] /= length;
+	return true;
 }
 
 bool oblique_turn(struct oblique *oblique, const double normal[3], const double up[3])
@@ -273,8 +279,8 @@ static void put_row(const float *values, const int *counts, int count, const str
 	}
 }
 
-void oblique_make(const float *voxels, const struct grid *grid, const struct oblique *oblique,
-		  unsigned char *ret_pixels)
+bool oblique_make(const float *voxels, const struct grid *grid, const struct oblique *oblique,
+		  bool (*wanted)(void *context), void *context, unsigned char *ret_pixels)
 {
 	const struct cell cell = cell_of(voxels, grid);
 	const int layers = oblique_layers(oblique, grid), width = oblique->size[0], lines = oblique->size[1] * layers;
@@ -287,6 +293,8 @@ void oblique_make(const float *voxels, const struct grid *grid, const struct obl
 	for (int left = 0; left < width; left += TILE) {
 		int count = smaller(TILE, width - left);
 
+		if (!wanted(context))
+			return false;
 		for (int n = -1; n < lines; n++) {
 			int row = n / layers, layer = n % layers;
 
@@ -308,4 +316,5 @@ void oblique_make(const float *voxels, const struct grid *grid, const struct obl
 					ret_pixels + (size_t)row * (size_t)width + (size_t)left);
 		}
 	}
+	return true;
 }

@@ -42,8 +42,11 @@ struct oblique oblique_along(const struct grid *grid, int axis, int index);
 /* The number of layers; 1 of a plane. */
 int oblique_layers(const struct oblique *oblique, const struct grid *grid);
 
-/* voxels [z][y][x], 1/mm. ret_pixels [rows][columns]; black where there is no volume. Any thread. */
-void oblique_make(const float *voxels, const struct grid *grid, const struct oblique *oblique,
-		  unsigned char *ret_pixels);
+/*
+ * voxels [z][y][x], 1/mm. ret_pixels [rows][columns]; black where there is no volume. Any thread. `wanted` is asked
+ * every some milliseconds whether to go on; false where it said no, and the picture is not whole.
+ */
+bool oblique_make(const float *voxels, const struct grid *grid, const struct oblique *oblique,
+		  bool (*wanted)(void *context), void *context, unsigned char *ret_pixels);
 
 #endif

@@ -19,13 +19,19 @@ struct api {
 	struct fleet *fleet;   /* NULL: it is in none */
 	struct homes *homes;   /* NULL: likewise */
 	struct keeper *keeper; /* NULL: everything is kept */
-	double max_wait;       /* s */
-	double started;        /* clock_monotonic */
+	struct pictures *pictures;
+	double max_wait; /* s */
+	double started;  /* clock_monotonic */
 };
 
 /* Removes what is older than `seconds` (0: nothing), from now on; after all others were started. */
 int keeper_start(struct api *api, double seconds, struct keeper **ret_keeper, struct error *err);
 void keeper_stop(struct keeper *keeper); /* NULL is fine; before any other is stopped */
+
+/* The threads that draw pictures; before the server starts, and stopped after it. patience: s that one waits for its
+ * turn. */
+int pictures_start(double patience, struct pictures **ret_pictures, struct error *err);
+void pictures_stop(struct pictures *pictures); /* NULL is fine */
 
 /*
  * For struct http_options: what a request names and is not here may be another host's of the fleet. 307 with that

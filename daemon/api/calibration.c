@@ -114,20 +114,44 @@ int calibration_delete(void *context, struct request *request, struct error *err
 	return code != 0 ? code : request_reply_empty(request, 204, err);
 }
 
-int calibration_view_get(void *context, struct request *request, struct error *err)
-{
-	struct api *api = context;
-	const char *text = request_argument(request, 1);
-	size_t length;
-	char *png;
+/* A picture that a request waits for. */
+struct wanted {
+	struct api *api;
+	char id[ID_SIZE];
 	long view;
+};
 
-	if (!index_parse(text, strlen(text), VIEWS_MAX, &view))
-		return error_set(err, ERR_NOT_FOUND, "\"%.40s\" is no view", text);
-	if (calibration_picture(api->calibrations, request_argument(request, 0), view, &png, &length, err) != 0 ||
-	    request_reply_bytes(request, 200, png, length, err) != 0)
-		return err->code;
+static int draw_wanted(void *subject, struct picture *picture, char **ret_png, size_t *ret_length, struct error *err)
+{
+	const struct wanted *wanted = subject;
+
+	(void)picture;
+	return calibration_picture(wanted->api->calibrations, wanted->id, wanted->view, ret_png, ret_length, err);
+}
+
+static void add_headers(void *subject, struct request *request)
+{
+	(void)subject;
 	request_reply_header(request, "Content-Type", "image/png");
 	request_reply_header(request, "Cache-Control", "private, no-cache");
-	return 0;
+}
+
+static const struct picture_kind views = {draw_wanted, add_headers, NULL};
+
+int calibration_view_get(void *context, struct request *request, struct error *err)
+{
+	const char *text = request_argument(request, 1);
+	struct wanted *wanted;
+	long view;
+
+	if (request_state(request) != NULL)
+		return picture_go_on(request, err);
+	if (!index_parse(text, strlen(text), VIEWS_MAX, &view))
+		return error_set(err, ERR_NOT_FOUND, "\"%.40s\" is no view", text);
+	wanted = calloc(1, sizeof(*wanted));
+	if (wanted != NULL) {
+		*wanted = (struct wanted){.api = context, .view = view};
+		snprintf(wanted->id, sizeof(wanted->id), "%s", request_argument(request, 0));
+	}
+	return picture_begin(context, request, &views, wanted, err);
 }

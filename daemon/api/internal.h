@@ -12,6 +12,8 @@
 
 /* Shared by the files of this room. */
 
+struct picture;
+
 /* ---- the handlers, as struct route wants them ---- */
 int session_post(void *context, struct request *request, struct error *err);
 int session_get(void *context, struct request *request, struct error *err);
@@ -163,6 +165,31 @@ void job_forget_files(struct api *api, struct job *job);
 /* As store_volume_verify; damage is a warning of the job, too. */
 int volume_verify(struct api *api, const char *job, const struct volume_record *volume, uint64_t first, uint64_t bytes,
 		  struct error *err);
+
+/* ---- pictures, drawn apart from the threads that answer: api/picture.c ---- */
+struct picture_kind {
+	/* A painter's thread, which calls it once; the subject does not change meanwhile. */
+	int (*draw)(void *subject, struct picture *picture, char **ret_png, size_t *ret_length, struct error *err);
+	void (*headers)(void *subject, struct request *request); /* after the reply was made */
+	void (*free)(void *subject);                             /* what it holds, but not itself; NULL: nothing */
+};
+/*
+ * Has the picture drawn: HTTP_WAIT, and then picture_go_on until it has replied. Takes the subject (free), NULL for
+ * ERR_NO_MEMORY. ERR_BUSY where too many wait, ERR_CANCELLED where the client has gone before it was drawn.
+ */
+int picture_begin(struct api *api, struct request *request, const struct picture_kind *kind, void *subject,
+		  struct error *err);
+int picture_go_on(struct request *request, struct error *err);
+/* False: nobody waits for this struct picture any more, and `draw` may return ERR_CANCELLED. The painter's thread. */
+bool picture_wanted(void *picture);
+
+enum picture_end { PICTURE_DRAWN, PICTURE_FAILED, PICTURE_REFUSED, PICTURE_GONE, PICTURE_END_COUNT };
+extern const char *const picture_end_names[PICTURE_END_COUNT];
+struct pictures_statistics {
+	int waiting, drawing; /* now */
+	unsigned long long ended[PICTURE_END_COUNT];
+};
+void pictures_statistics(struct pictures *pictures, struct pictures_statistics *ret);
 
 /* ---- volumes in requests and replies: api/volume.c ---- */
 enum { VOLUME_FILENAME_MAX = 96 };

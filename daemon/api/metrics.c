@@ -145,6 +145,19 @@ static void write_uploads(FILE *out, struct api *api)
 	single(out, "sync_seconds_total", "counter", "Time they took.", uploads.sync_seconds);
 }
 
+static void write_pictures(FILE *out, struct api *api)
+{
+	struct pictures_statistics pictures;
+
+	pictures_statistics(api->pictures, &pictures);
+	single(out, "pictures_drawing", "gauge", "Pictures that are being drawn.", pictures.drawing);
+	single(out, "pictures_waiting", "gauge", "Pictures that wait for their turn.", pictures.waiting);
+	describe(out, "pictures_ended_total", "counter",
+		 "Pictures that were asked for, by how that ended; gone: the client had, and they were not drawn.");
+	for (int i = 0; i < PICTURE_END_COUNT; i++)
+		fprintf(out, "cbctd_pictures_ended_total{how=\"%s\"} %llu\n", picture_end_names[i], pictures.ended[i]);
+}
+
 /* ---- the store and its disk ---- */
 
 static void write_store(FILE *out, struct api *api)
@@ -420,6 +433,7 @@ int metrics_get(void *context, struct request *request, struct error *err)
 	single(out, "uptime_seconds", "gauge", "Since the daemon's start.", clock_monotonic() - api->started);
 	write_http(out, api);
 	write_uploads(out, api);
+	write_pictures(out, api);
 	write_store(out, api);
 	write_fleet(out, api);
 	write_disk(out, api);

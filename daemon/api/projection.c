@@ -260,37 +260,82 @@ static void make_etag(const uint8_t sha256[32], const char *kind, char ret_etag[
 	snprintf(ret_etag, ETAG_MAX, "\"%s%s\"", digest, kind);
 }
 
-static int reply_picture(struct request *request, struct stored_scan *stored, int descriptor, int index,
-			 const uint8_t sha256[32], struct error *err)
+/* A picture that a request waits for. */
+struct wanted {
+	struct stored_scan *stored;
+	int descriptor, index;
+	struct selection selection;
+	char etag[ETAG_MAX];
+};
+
+static struct entity entity_of(const struct wanted *wanted)
+{
+	return (struct entity){.etag = wanted->etag, .size = UNKNOWN_SIZE, .media_type = "image/png"};
+}
+
+static int draw_wanted(void *subject, struct picture *picture, char **ret_png, size_t *ret_length, struct error *err)
+{
+	const struct wanted *wanted = subject;
+	const struct scan *scan = stored_scan_parsed(wanted->stored);
+	void *samples = malloc(scan_projection_bytes(scan));
+	struct sum sum;
+	int code;
+
+	(void)picture;
+	if (samples == NULL)
+		return error_set(err, ERR_NO_MEMORY, "no memory for a picture");
+	code = stored_scan_read(wanted->stored, wanted->descriptor, wanted->index, samples, &sum, err);
+	if (code == 0)
+		code = draw(samples, scan, ret_png, ret_length, err);
+	free(samples);
+	return code;
+}
+
+static void add_headers(void *subject, struct request *request)
+{
+	const struct wanted *wanted = subject;
+	const struct entity entity = entity_of(wanted);
+
+	entity_headers(request, &entity, &wanted->selection);
+}
+
+static void free_wanted(void *subject)
+{
+	struct wanted *wanted = subject;
+
+	close(wanted->descriptor);
+	stored_scan_release(wanted->stored);
+}
+
+static const struct picture_kind projections = {draw_wanted, add_headers, free_wanted};
+
+/* Takes the descriptor. */
+static int reply_picture(struct api *api, struct request *request, struct stored_scan *stored, int descriptor,
+			 int index, const uint8_t sha256[32], struct error *err)
 {
 	enum { PICTURE_PIXELS_MAX = 64 << 20 };
 	const struct scan *scan = stored_scan_parsed(stored);
-	size_t size = scan_projection_bytes(scan), length;
-	char *png, etag[ETAG_MAX];
-	const struct entity entity = {.etag = etag, .size = UNKNOWN_SIZE, .media_type = "image/png"};
-	struct selection selection;
-	struct sum sum;
-	void *samples;
-	bool done;
-	int code;
+	const size_t pixels = scan_projection_bytes(scan) / sample_bytes(scan->sample);
+	struct wanted *wanted = calloc(1, sizeof(*wanted)), read = {.descriptor = descriptor, .index = index};
+	const struct entity entity = entity_of(&read);
+	bool done = false;
+	int code = 0;
 
-	make_etag(sha256, "-png", etag);
-	if (entity_select(request, &entity, &selection, &done, err) != 0 || done)
-		return done ? 0 : err->code;
-	if (size > PICTURE_PIXELS_MAX * sample_bytes(scan->sample))
-		return error_set(err, ERR_IMPOSSIBLE, "a picture has at most %d pixels, the projection %zu",
-				 PICTURE_PIXELS_MAX, size / sample_bytes(scan->sample));
-	samples = malloc(size);
-	if (samples == NULL)
-		return error_set(err, ERR_NO_MEMORY, "no memory for a picture");
-	code = stored_scan_read(stored, descriptor, index, samples, &sum, err);
-	if (code == 0)
-		code = draw(samples, scan, &png, &length, err);
-	if (code == 0)
-		code = request_reply_bytes(request, 200, png, length, err);
-	free(samples);
-	if (code == 0)
-		entity_headers(request, &entity, &selection);
+	make_etag(sha256, "-png", read.etag);
+	code = entity_select(request, &entity, &read.selection, &done, err);
+	if (code == 0 && !done && pixels > PICTURE_PIXELS_MAX)
+		code = error_set(err, ERR_IMPOSSIBLE, "a picture has at most %d pixels, the projection %zu",
+				 PICTURE_PIXELS_MAX, pixels);
+	if (code == 0 && !done && wanted == NULL)
+		code = error_set(err, ERR_NO_MEMORY, "no memory for a picture");
+	if (code == 0 && !done) /* the picture's own reference */
+		code = store_scan_find(api->store, request_argument(request, 0), &read.stored, err);
+	if (code == 0 && !done) {
+		*wanted = read;
+		return picture_begin(api, request, &projections, wanted, err);
+	}
+	close(descriptor);
+	free(wanted);
 	return code;
 }
 
@@ -321,7 +366,7 @@ static int reply_samples(struct request *request, const struct scan *scan, int d
 	return 0;
 }
 
-static int reply_projection(struct request *request, struct stored_scan *stored, struct error *err)
+static int reply_projection(struct api *api, struct request *request, struct stored_scan *stored, struct error *err)
 {
 	static const char *const formats[] = {"raw", "png", NULL};
 	const struct scan *scan = stored_scan_parsed(stored);
@@ -341,7 +386,7 @@ static int reply_projection(struct request *request, struct stored_scan *stored,
 	if (code == 0 && format == 0)
 		return reply_samples(request, scan, descriptor, (int)index, sum.sha256, err);
 	if (code == 0)
-		code = reply_picture(request, stored, descriptor, (int)index, sum.sha256, err);
+		return reply_picture(api, request, stored, descriptor, (int)index, sum.sha256, err);
 	close(descriptor);
 	return code;
 }
@@ -352,9 +397,11 @@ int projection_get(void *context, struct request *request, struct error *err)
 	struct stored_scan *scan;
 	int code;
 
+	if (request_state(request) != NULL)
+		return picture_go_on(request, err);
 	if (store_scan_find(api->store, request_argument(request, 0), &scan, err) != 0)
 		return err->code;
-	code = reply_projection(request, scan, err);
+	code = reply_projection(api, request, scan, err);
 	stored_scan_release(scan);
 	return code;
 }

@@ -15,10 +15,7 @@
 static const double window_default = 2000, level_default = 0;
 static const double number_most = 1e6;
 static const char *const axis_names[] = {"x", "y", "z", NULL};
-/*
- * Samples of a picture: a fifth of a second of a processor. The thread that draws it serves other connections, too,
- * and a 30 mm slab of 512 x 512 pixels through voxels of .5 mm is within.
- */
+/* Samples: a fifth of a second of a processor. A 30 mm slab of 512 x 512 pixels through voxels of .5 mm is within. */
 static const double samples_most = 1 << 24;
 
 struct asked {
@@ -108,26 +105,30 @@ static int refuse(struct request *request, const char *const *names, const char 
 
 /* ---- planes at any angle ---- */
 
+/* "400,300": whole numbers, in digits. */
 static int read_size(struct request *request, int *ret_size, struct error *err)
 {
-	double size[2] = {ret_size[0], ret_size[1]};
+	const char *text = request_query(request, "size");
+	const char *comma = text != NULL ? strchr(text, ',') : NULL;
+	long columns, rows;
 
-	if (read_numbers(request, "size", 2, 1, OBLIQUE_SIZE_MAX, size, err) != 0)
-		return err->code;
-	for (int i = 0; i < 2; i++) {
-		if (size[i] != floor(size[i]))
-			return error_set(err, ERR_INVALID, "size is \"%.40s\", expected two whole numbers",
-					 request_query(request, "size"));
-		ret_size[i] = (int)size[i];
-	}
+	if (text == NULL)
+		return 0;
+	if (comma == NULL || !index_parse(text, (size_t)(comma - text), OBLIQUE_SIZE_MAX, &columns) ||
+	    !index_parse(comma + 1, strlen(comma + 1), OBLIQUE_SIZE_MAX, &rows) || columns < 1 || rows < 1)
+		return error_set(err, ERR_INVALID,
+				 "size is \"%.40s\", expected two whole numbers from 1 to %d with a comma between",
+				 text, OBLIQUE_SIZE_MAX);
+	ret_size[0] = (int)columns;
+	ret_size[1] = (int)rows;
 	return 0;
 }
 
 /* Upwards is z, or the table's front where one looks along z. */
 static void default_up(const double normal[3], double ret_up[3])
 {
-	bool along =
-	    fabs(normal[2]) > 0.99 * sqrt(normal[0] * normal[0] + normal[1] * normal[1] + normal[2] * normal[2]);
+	/* hypot() takes components whose squares would be 0 or infinite. */
+	bool along = fabs(normal[2]) > 0.99 * hypot(hypot(normal[0], normal[1]), normal[2]);
 
 	memcpy(ret_up, along ? (double[]){0, -1, 0} : (double[]){0, 0, 1}, 3 * sizeof(*ret_up));
 }
@@ -207,11 +208,13 @@ static int read_along(struct request *request, const struct grid *grid, struct a
 {
 	static const char *const switches[] = {"0", "1", NULL};
 	static const char *const at_angles[] = {"up", "center", "size", "spacing", NULL};
+	static const char *const one[] = {"index", NULL};
 	int axis = 2, sheet;
 
 	if (refuse(request, at_angles, "without normal", err) != 0 ||
 	    (request_query(request, "axis") != NULL && query_choice(request, "axis", axis_names, &axis, err) != 0) ||
 	    query_choice(request, "sheet", switches, &sheet, err) != 0 ||
+	    (sheet == 1 && refuse(request, one, "for a contact sheet, which shows all", err) != 0) ||
 	    read_index(request, grid->size[axis], axis_names[axis], &ret->index, err) != 0)
 		return err->code;
 	ret->sheet = sheet == 1;
@@ -237,8 +240,8 @@ static int read_asked(struct request *request, const struct grid *grid, double m
 
 /* ---- the picture ---- */
 
-static int draw(const float *voxels, const struct grid *grid, const struct asked *asked, char **ret_png,
-		size_t *ret_length, struct error *err)
+static int draw(const float *voxels, const struct grid *grid, const struct asked *asked, struct picture *picture,
+		char **ret_png, size_t *ret_length, struct error *err)
 {
 	struct sheet sheet;
 	int size[2], code = 0;
@@ -258,9 +261,9 @@ static int draw(const float *voxels, const struct grid *grid, const struct asked
 		return error_set(err, ERR_NO_MEMORY, "no memory for a picture");
 	if (asked->sheet)
 		code = sheet_make(voxels, grid, &asked->slice, &sheet, pixels, err);
-	else if (asked->sampled)
-		oblique_make(voxels, grid, &asked->oblique, pixels);
-	else
+	else if (asked->sampled && !oblique_make(voxels, grid, &asked->oblique, picture_wanted, picture, pixels))
+		code = error_set(err, ERR_CANCELLED, "nobody waits for the picture");
+	else if (!asked->sampled)
 		slice_make(voxels, grid, &asked->slice, asked->index, pixels);
 	if (code == 0)
 		code = gray_png(pixels, size[0], size[1], pixel_mm, ret_png, ret_length, err);
@@ -288,25 +291,41 @@ static void make_etag(const char *job, const struct volume_record *volume, const
 			 asked->sheet ? asked->slice.axis : asked->index, asked->window, asked->level);
 }
 
-static int reply_drawn(struct api *api, struct request *request, const char *job, const struct volume_record *volume,
-		       const struct asked *asked, struct error *err)
+/* A picture that a request waits for. */
+struct wanted {
+	struct api *api;
+	char job[ID_SIZE];
+	struct volume_record volume;
+	struct asked asked;
+	struct selection selection;
+	char etag[480];
+};
+
+static struct entity entity_of(const struct wanted *wanted)
 {
-	size_t plane = (size_t)volume->grid.size[0] * (size_t)volume->grid.size[1] * sizeof(float), length;
+	return (struct entity){.etag = wanted->etag, .size = UNKNOWN_SIZE, .media_type = "image/png"};
+}
+
+static int draw_wanted(void *subject, struct picture *picture, char **ret_png, size_t *ret_length, struct error *err)
+{
+	const struct wanted *wanted = subject;
+	const struct volume_record *volume = &wanted->volume;
+	const struct asked *asked = &wanted->asked;
+	size_t plane = (size_t)volume->grid.size[0] * (size_t)volume->grid.size[1] * sizeof(float);
 	bool one = asked->slice.axis == 2 && !asked->sheet && !asked->sampled;
-	const struct grid *grid = &volume->grid;
 	struct mapping *mapping;
-	char path[1024], *png;
-	int code =
-	    volume_verify(api, job, volume, one ? (uint64_t)asked->index * plane : 0, one ? plane : volume->bytes, err);
+	char path[1024];
+	int code = volume_verify(wanted->api, wanted->job, volume, one ? (uint64_t)asked->index * plane : 0,
+				 one ? plane : volume->bytes, err);
 
 	if (code != 0)
 		return code;
-	store_volume_path(api->store, job, volume->name, path);
-	if (mapping_get(api->mappings, path, grid, &mapping, err) != 0)
+	store_volume_path(wanted->api->store, wanted->job, volume->name, path);
+	if (mapping_get(wanted->api->mappings, path, &volume->grid, &mapping, err) != 0)
 		return err->code;
-	code = draw(mapping_voxels(mapping), grid, asked, &png, &length, err);
-	mapping_release(api->mappings, mapping);
-	return code == 0 ? request_reply_bytes(request, 200, png, length, err) : code;
+	code = draw(mapping_voxels(mapping), &volume->grid, asked, picture, ret_png, ret_length, err);
+	mapping_release(wanted->api->mappings, mapping);
+	return code;
 }
 
 /* Which sides of the patient, or ends of the world's axes, lie at the edges of the picture. */
@@ -334,26 +353,46 @@ static void reply_sides(struct api *api, struct request *request, const struct o
 			     edge[1], edge[2], edge[3]);
 }
 
+static void add_headers(void *subject, struct request *request)
+{
+	const struct wanted *wanted = subject;
+	const struct entity entity = entity_of(wanted);
+
+	entity_headers(request, &entity, &wanted->selection);
+	reply_sides(wanted->api, request, &wanted->asked.oblique);
+}
+
+static const struct picture_kind slices = {draw_wanted, add_headers, NULL};
+
+/* What the request asks for; *ret_done: it has its reply. */
+static int read_wanted(struct request *request, struct wanted *wanted, bool *ret_done, struct error *err)
+{
+	struct entity entity = entity_of(wanted);
+	struct job_facts facts;
+
+	if (volume_asked(wanted->api, request, &facts, &wanted->volume, err) != 0 ||
+	    read_asked(request, &wanted->volume.grid, facts.mu_water, &wanted->asked, err) != 0)
+		return err->code;
+	snprintf(wanted->job, sizeof(wanted->job), "%s", facts.id);
+	make_etag(facts.id, &wanted->volume, &wanted->asked, wanted->etag, sizeof(wanted->etag));
+	return entity_select(request, &entity, &wanted->selection, ret_done, err);
+}
+
 int slice_get(void *context, struct request *request, struct error *err)
 {
-	struct api *api = context;
-	struct volume_record volume;
-	struct job_facts facts;
-	struct asked asked = {0};
-	char etag[480];
-	struct entity entity = {.etag = etag, .size = UNKNOWN_SIZE, .media_type = "image/png"};
-	struct selection selection;
-	bool done;
+	struct wanted *wanted;
+	bool done = false;
+	int code;
 
-	if (volume_asked(api, request, &facts, &volume, err) != 0 ||
-	    read_asked(request, &volume.grid, facts.mu_water, &asked, err) != 0)
-		return err->code;
-	make_etag(facts.id, &volume, &asked, etag, sizeof(etag));
-	if (entity_select(request, &entity, &selection, &done, err) != 0 || done)
-		return done ? 0 : err->code;
-	if (reply_drawn(api, request, facts.id, &volume, &asked, err) != 0)
-		return err->code;
-	entity_headers(request, &entity, &selection);
-	reply_sides(api, request, &asked.oblique);
-	return 0;
+	if (request_state(request) != NULL)
+		return picture_go_on(request, err);
+	wanted = calloc(1, sizeof(*wanted));
+	if (wanted == NULL)
+		return error_set(err, ERR_NO_MEMORY, "no memory for a picture");
+	wanted->api = context;
+	code = read_wanted(request, wanted, &done, err);
+	if (code == 0 && !done)
+		return picture_begin(context, request, &slices, wanted, err);
+	free(wanted);
+	return code;
 }

@@ -166,6 +166,11 @@ void request_session_close(struct request *request);
 /* ---- waiting ---- */
 /* Before HTTP_WAIT: be called again at that time (clock_monotonic) in any case. */
 void request_wait_until(struct request *request, double time);
+/*
+ * The client has closed its side, or the connection is broken: on TCP nobody can tell one that still reads from one
+ * that has gone. Any thread, while the request lives; takes no lock.
+ */
+bool request_peer_gone(const struct request *request);
 /* The daemon is about to stop: what waits for a change should answer now. */
 bool request_stopping(const struct request *request);
 /* Any thread, while the request lives; as often as you like; takes no lock of ours but its own. */

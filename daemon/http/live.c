@@ -44,6 +44,13 @@ bool live_hung_up(const struct connection *connection)
 	return got == 0 || (got < 0 && errno != EAGAIN && errno != EWOULDBLOCK && errno != EINTR);
 }
 
+bool request_peer_gone(const struct request *request)
+{
+	struct pollfd poll_one = {request->connection->socket, POLLRDHUP, 0};
+
+	return poll(&poll_one, 1, 0) > 0;
+}
+
 uint64_t live_acknowledged(const struct connection *connection)
 {
 	struct tcp_info info = {0};

@@ -3,14 +3,13 @@
  * with --wrap=fdatasync, a worker whose syncs do not return while the file that
  * CBCT_TEST_HOLD names is there; with --wrap=recon_push, a worker that takes no projection while that of
  * CBCT_TEST_HANG is; with --wrap=job_digest_volume, a daemon whose
- * digests do not come while that of CBCT_TEST_HOLD_DIGEST is; and with the calls
- * of the store below, a daemon that cannot record what the file of
- * CBCT_TEST_REFUSE names: "running", "digest" or "volume NAME"; and a daemon in which the part hangs that the file of
- * CBCT_TEST_STUCK names: "http", "thread" (one of the server's, the first that is asked), "supervisor" or "catalogue".
- * A worker with CBCT_TEST_CARDS in its environment
- * pretends that the processor is a card, whose calls fail while the file that it names says so: "CALL DEVICES", where
- * CALL is "filter" or "iterate", which end in a device error, or "hang" and "kill", which do that at an iteration. A
- * job on several of them has each as its own card.
+ * digests do not come while that of CBCT_TEST_HOLD_DIGEST is, and whose slabs and oblique planes are not drawn while
+ * that of CBCT_TEST_HOLD_DRAWING is; and with the calls of the store below, a daemon that cannot record what the file
+ * of CBCT_TEST_REFUSE names: "running", "digest" or "volume NAME"; and a daemon in which the part hangs that the file
+ * of CBCT_TEST_STUCK names: "http", "thread" (one of the server's, the first that is asked), "supervisor" or
+ * "catalogue". A worker with CBCT_TEST_CARDS in its environment pretends that the processor is a card, whose calls fail
+ * while the file that it names says so: "CALL DEVICES", where CALL is "filter" or "iterate", which end in a device
+ * error, or "hang" and "kill", which do that at an iteration. A job on several of them has each as its own card.
  */
 #include <signal.h>
 #include <pthread.h>
@@ -24,6 +23,7 @@
 
 #include "daemon/http/http.h"
 #include "daemon/jobs/job.h"
+#include "proto/oblique.h"
 
 /* Weak: a program has one of them. */
 int __real_fdatasync(int file) __attribute__((weak));
@@ -34,6 +34,11 @@ int __wrap_recon_push(struct recon *recon, const void *samples, const int *views
 int __real_job_digest_volume(struct job *job, const struct volume_record *volume, struct error *err)
     __attribute__((weak));
 int __wrap_job_digest_volume(struct job *job, const struct volume_record *volume, struct error *err);
+
+bool __real_oblique_make(const float *voxels, const struct grid *grid, const struct oblique *oblique,
+			 bool (*wanted)(void *context), void *context, unsigned char *ret_pixels) __attribute__((weak));
+bool __wrap_oblique_make(const float *voxels, const struct grid *grid, const struct oblique *oblique,
+			 bool (*wanted)(void *context), void *context, unsigned char *ret_pixels);
 
 int __real_store_job_update(struct store *store, const struct job_record *job, const struct event *event,
 			    const struct event *end, enum job_past past, struct error *err) __attribute__((weak));
@@ -82,6 +87,13 @@ int __wrap_job_digest_volume(struct job *job, const struct volume_record *volume
 {
 	hold("CBCT_TEST_HOLD_DIGEST");
 	return __real_job_digest_volume(job, volume, err);
+}
+
+bool __wrap_oblique_make(const float *voxels, const struct grid *grid, const struct oblique *oblique,
+			 bool (*wanted)(void *context), void *context, unsigned char *ret_pixels)
+{
+	hold("CBCT_TEST_HOLD_DRAWING");
+	return __real_oblique_make(voxels, grid, oblique, wanted, context, ret_pixels);
 }
 
 /* ---- cards ---- */

@@ -8,7 +8,8 @@ cbct simulate --phantom ball --scale 30 --density 0.02 --shift 12,-9,10 --views 
 	--source-to-isocentre 600 --source-to-detector 1000 -o "$scan_dir" >/dev/null || exit 1
 
 # The job that all tests look at; the daemon and its state stay.
-start_daemon || exit 1
+export CBCT_TEST_HOLD_DRAWING=$work/hold-drawing
+start_daemon --listen "unix:$work/socket" --picture-patience 3600 || exit 1
 post_scan "$scan_dir"
 post_projections "$scan_dir"
 post_job '{"scan": "SCAN", "grid": {"size": [31, 24, 15], "spacing_mm": [3, 4, 5]}, "fdk": {}}'
@@ -64,7 +65,7 @@ test_tags_save_the_drawing() {
 }
 
 test_planes_and_slabs_at_any_angle_are_the_volume_resampled() {
-	local python=${PYTHON:-/usr/bin/python3}
+	local normal python=${PYTHON:-/usr/bin/python3}
 	"$python" -c 'import numpy' 2>/dev/null || skip "numpy is not here"
 	get_volume final "$work/v.raw" format=raw
 	"$python" "$here/oblique.py" "$url" "$volume" "$work/v.raw" 31,24,15 3,4,5 -45,-46,-35 700 0 0.0192 || fail "the same pixels"
@@ -80,6 +81,14 @@ test_planes_and_slabs_at_any_angle_are_the_volume_resampled() {
 	cp "$work/body" "$work/straight"
 	req GET "$volume/slice?normal=6.123233995736766e-17,1E0,0"
 	cmp -s "$work/body" "$work/straight" || fail "the same plane by numbers with an exponent"
+	# of whatever length, whose square may be nothing
+	for normal in 0,1e-165,0 0,5e-324,0 0,1000000,0; do
+		req GET "$volume/slice?normal=$normal"
+		expect_status 200
+		cmp -s "$work/body" "$work/straight" || fail "the same plane by the normal $normal"
+	done
+	req GET "$volume/slice?normal=0,0,3e-200"
+	expect_status 200
 	# Layers beyond the volume, along lines that would meet it billions of pixels away.
 	req GET "$volume/slice?normal=0,0,1&up=0,-1,0&thickness=203&mode=max"
 	cp "$work/body" "$work/straight"
@@ -113,9 +122,9 @@ test_what_cannot_be_is_refused_by_its_name() {
 	for query in axis=w index=15 index=-1 index=1.5 index=x "axis=x&index=31" window=0 window=-5 window=nan level=high sheet=2 \
 		normal=0,0,0 normal=1,0 normal=1,0,0,0 normal=1,x,0 normal=1,0, normal=0x10,0,0 normal= "normal=1,0,0&up=2,0,0" "normal=1,0,0&up=0,0,0" \
 		"normal=1,0,0&center=500,0,0" "normal=1,0,0&center=1,2" "normal=1,0,0&size=0,5" "normal=1,0,0&size=5" "normal=1,0,0&size=2049,5" \
-		"normal=1,0,0&size=5.5,5" "normal=1,0,0&spacing=0" "normal=1,0,0&spacing=-1" "normal=1,0,0&axis=x" "normal=1,0,0&index=3" \
+		"normal=1,0,0&size=5.5,5" "normal=1,0,0&size=1e2,2" "normal=1,0,0&size=2,,2" "normal=1,0,0&size=2,2," "normal=1,0,0&spacing=0" "normal=1,0,0&spacing=-1" "normal=1,0,0&axis=x" "normal=1,0,0&index=3" \
 		"normal=1,0,0&sheet=1" up=0,0,1 center=0,0,0 size=5,5 spacing=1 thickness=0 thickness=-3 thickness=thick thickness=1001 \
-		"thickness=5&mode=median" mode=max "sheet=1&thickness=4" "normal=1,0,0&size=2048,2048&thickness=200" "normal=1,0.3,0.3&size=2048,2048&spacing=0.02&thickness=20"; do
+		"thickness=5&mode=median" mode=max "sheet=1&thickness=4" "sheet=1&index=3" "normal=1,0,0&size=2048,2048&thickness=200" "normal=1,0.3,0.3&size=2048,2048&spacing=0.02&thickness=20"; do
 		req GET "$volume/slice?$query"
 		expect_problem 400
 		expect_json ".detail | contains(\"$(sed 's/.*&//; s/=.*//' <<<"$query")\")" # the last one is at fault
@@ -168,6 +177,24 @@ test_other_formats_and_scales() {
 		awk '{ d = $1 - $2; n++; if (d > 1e-6 || d < -1e-6) bad++ } END { exit bad > 0 || n != 16 * 12 * 8 }' || fail "the means"
 	get_volume final "$work/half.again" "format=raw&scale=2"
 	cmp "$work/half.raw" "$work/half.again" || fail "the same bytes twice"
+}
+
+# A scan of small projections that lacks them all.
+post_incomplete() {
+	cbct simulate -o "$work/small" --phantom ball --views 4 --columns 8 --rows 8 --pixel 20 >/dev/null
+	post_scan "$work/small"
+}
+
+test_nobody_waits_for_the_pictures_of_others_and_none_is_drawn_for_who_has_gone() {
+	post_incomplete
+	"${PYTHON:-/usr/bin/python3}" "$here/pictures.py" "$url" "$work/socket" "$volume" "$scan" "$CBCT_TEST_HOLD_DRAWING" || fail "what it says"
+}
+
+test_a_turn_that_does_not_come_is_refused() {
+	post_incomplete
+	stop_daemon
+	start_daemon --picture-patience 0.1
+	"${PYTHON:-/usr/bin/python3}" "$here/pictures.py" "$url" "$work/socket" "$volume" "$scan" "$CBCT_TEST_HOLD_DRAWING" late || fail "what it says"
 }
 
 run_tests
