@@ -672,6 +672,38 @@ test('the plot has the points of the history on a logarithmic axis', async () =>
 	await page.context().close()
 })
 
+test('what was refined is drawn over the projections, stands in a table, and is kept as a calibration by a button', async () => {
+	const page = await open(browser, '/')
+	const views = Array.from({ length: 31 }, (_, k) => ({ projection: k, shift_mm: [Math.sin(k / 5), 0.5, -k / 30], turn_deg: [0, 0.01 * k, -0.2] }))
+	const kept = []
+	await page.route(`**/v1/jobs/${finished}`, async route => {
+		const document = await (await route.fetch()).json()
+		await route.fulfill({ json: { ...document, refinement: `/v1/jobs/${finished}/refinement`, warnings: [{ code: 'geometry_refined', severity: 'info', summary: 'x', detail: 'x' }] } })
+	})
+	await page.route(`**/v1/jobs/${finished}/refinement`, route => route.fulfill({ json: { kind: 'geometry', accepted: true, rms_mm: 0.93, rms_deg: 0.25, most_mm: 1.4, most_deg: 0.36,
+		held_out: { views: 4, better: 3, unexplained_before: 0.02, unexplained_after: 0.01 }, views, geometry: null } }))
+	await page.route('**/v1/calibrations', route => (kept.push(route.request().postDataJSON()), route.fulfill({ status: 202, json: { id: '1m83bhm0tp4wkcj4' } })))
+	await page.goto(`${origin}${finishedPath}`)
+	await page.waitForSelector('.plot.refined .line')
+	for (const [key, axis] of [['shift_mm', 0], ['shift_mm', 2], ['turn_deg', 1]]) {
+		const line = await page.getAttribute(`.plot.refined .${key} .line.axis-${axis}`, 'd')
+		const points = line.slice(1).split('L').map(point => point.split(',').map(Number))
+		expect(points.length === views.length && points.every((point, i) => i === 0 || point[0] > points[i - 1][0]), `${key}: a point for each projection, from left to right`)
+		expect(correlation(views.map(view => view[key][axis]), points.map(point => -point[1])) > 0.999, `${key}, axis ${axis}: heights as the numbers`)
+	}
+	const box = await page.locator('.plot.refined').boundingBox()
+	await page.locator('.plot.refined').hover({ position: { x: box.width * (46 + 282 / 3) / 340, y: box.height / 3 } })
+	await until('the projection under the pointer', () => page.textContent('.refinement .reading'), text => text.startsWith('Projection 10: columns 0.91, rows 0.5, across −0.33 mm'))
+	await page.click('.refinement summary')
+	await until('the same as a table', () => page.locator('.refinement tbody tr').count(), count => count === views.length)
+	await accessible(page, 'the refinement')
+	await page.fill('.refinement input', 'room 2')
+	await page.click('.refinement button')
+	await until('what was kept', () => page.textContent('.refinement [role="status"]'), text => text === 'Kept as calibration 1m83bhm0tp4wkcj4')
+	expect(JSON.stringify(kept) === JSON.stringify([{ job: finished, arm: 'room 2' }]), `what was asked for: ${JSON.stringify(kept)}`)
+	await page.context().close()
+})
+
 test('warnings, parameters, geometry, projections and downloads', async () => {
 	const page = await openFinished()
 	expect(!await page.isVisible('button:has-text("Send to archive")'), 'no button where there is no archive')

@@ -8,6 +8,7 @@ import { Annotations } from './annotations.js'
 import { Tools, segments, press } from './tools.js'
 import { Viewer } from './viewer.js'
 import { Plot } from './plot.js'
+import { Refined } from './refined.js'
 import { troubleText } from './voxels.js'
 import { Others } from './compare.js'
 import { Sendings } from './send.js'
@@ -101,6 +102,7 @@ export class JobPage {
 		this.stage.append(this.viewer.element)
 		this.stage.addEventListener('pointerdown', event => this.#grabSwipe(event), { capture: true })
 		this.plot = new Plot(iteration => this.#selectIteration(iteration))
+		this.refined = new Refined(this.#abort.signal)
 		this.film = new Film()
 		this.sides = h('p', { class: 'sides', hidden: true }, t('Left and right are not known: neither scan nor job says how the patient lies. The letters are those of the table\'s axes.'))
 		this.fetching = h('p', { class: 'fetching', role: 'status', hidden: true })
@@ -117,7 +119,7 @@ export class JobPage {
 		this.progress = h('div', { class: 'progress' }, this.bar.element, this.doing, this.left)
 		this.columns = h('div', { class: 'columns' },
 			this.pictures = h('div', { class: 'pictures' }, this.acquiring, this.empty, this.stage, this.fetching, this.estimate, this.quality, this.sides, this.controls),
-			h('div', { class: 'aside' }, this.warnings, this.keyImages.section, this.tools.section, this.sendings.section, this.courseSection, this.fileSection,
+			h('div', { class: 'aside' }, this.warnings, this.keyImages.section, this.tools.section, this.sendings.section, this.courseSection, this.refined.section, this.fileSection,
 				this.filmSection = h('section', { class: 'card' }, h('h2', {}, t('Projections')), this.film.element),
 				h('section', { class: 'card' }, h('h2', {}, t('Reconstruction')), this.about),
 				h('section', { class: 'card' }, h('h2', {}, t('Geometry')), this.geometry)))
@@ -293,6 +295,7 @@ export class JobPage {
 		this.warnings.hidden = warnings.length === 0
 		replace(this.failure, job.error ? h('div', { class: 'notice bad' }, t('It failed: {why}', { why: problemText(job.error) })) : null)
 		this.sendings.show(job)
+		this.refined.show(job)
 		replace(this.about, jobFacts(job))
 		if (this.#first)
 			replace(this.geometry, geometryFacts(scan, job.patient))
