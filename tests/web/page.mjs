@@ -112,7 +112,7 @@ test('the list stands by state, says what tells jobs of a scan apart and how lon
 	const grid = { size: [40, 40, 40], spacing_mm: [3, 3, 3] }, sirt = { iterations: 3, subsets: 1 }
 	const [sharp, smooth] = await Promise.all(['ram-lak', 'hann'].map(window => post('/v1/jobs', { scan, grid, fdk: { window }, sart: sirt, labels: { side: `list ${window}` } })))
 	await Promise.all([sharp, smooth].map(job => ended(job.id)))
-	const running = await post('/v1/jobs', { scan, grid, fdk: {}, sart: { ...sirt, iterations: 100000 } })
+	const running = await post('/v1/jobs', { scan, grid, fdk: {}, sart: { ...sirt, iterations: 100000 }, emit: ['fdk'] })
 	const queued = await post('/v1/jobs', { scan, grid, fdk: {}, sart: sirt, priority: 'routine' })
 	const empty = await post('/v1/scans', { name: 'hip', ...await api(`/v1/scans/${scan}`).then(({ detector, projections, geometry }) => ({ detector, projections, geometry })) })
 	const waiting = await post('/v1/jobs', { scan: empty.id, grid, fdk: {} })
@@ -128,6 +128,9 @@ test('the list stands by state, says what tells jobs of a scan apart and how lon
 	expect(said.includes('window ram-lak') && said.includes('FDK + SART 3') && said.includes('list ram-lak'), `what is its own, got ${said}`)
 	const picture = await page.locator(`${row(sharp)} .thumb`).boundingBox()
 	expect(picture.width >= 120, `a large picture, got ${picture.width}`)
+	/* Of what runs there is the newest volume, and which that is; of what waits there is no gray that may be taken for one. */
+	await until('the newest picture of what runs', () => page.evaluate(row => document.querySelector(`${row} .thumb img`)?.naturalWidth > 0 && document.querySelector(`${row} .thumb`).textContent, row(running)), text => text === 'FDK')
+	expect(await page.textContent(`${row(waiting)} .thumb`) === 'no picture yet' && await page.locator(`${row(waiting)} .thumb img`).count() === 0, 'none of what waits')
 	await shoot(page, 'list-states')
 	await page.fill('[type=search]', 'LIST RAM')
 	await until('what was searched for', () => page.locator('.jobs a').count(), count => count === 1)

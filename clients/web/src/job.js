@@ -13,7 +13,7 @@ import { troubleText } from './voxels.js'
 import { Others } from './compare.js'
 import { Sendings } from './send.js'
 import { Film } from './film.js'
-import { Bar, badge, doing, left, ended, stateWord } from './state.js'
+import { Bar, badge, doing, left, ended, stateWord, volumeText } from './state.js'
 import { geometryFacts, jobFacts, warningList } from './facts.js'
 import { nameOf } from './lists.js'
 import { reconstructAgain, confirmed, openDialog, pinButton } from './form.js'
@@ -39,8 +39,6 @@ function qualityText(quality) {
 		held?.residual != null && t('projections held out are off by {n} %, those used by {m} %', { n: percent(held.residual), m: percent(held.used_residual) })].filter(Boolean)
 	return said.length > 0 ? t('Measured: {what}', { what: said.join(', ') }) : t('Too little of it is even for noise and edges to be measured.')
 }
-
-const volumeText = volume => volume.iteration > 0 ? t('iteration {n}', { n: volume.iteration }) : volume.stage === 'tv' ? t('FDK and TV') : 'FDK'
 
 export class JobPage {
 	#job = null

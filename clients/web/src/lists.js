@@ -1,7 +1,7 @@
 /* The first page: what runs, waits, is done and has failed, as it changes; the scans; what is bounded. */
 import { h, replace, write, throttle, inPieces, timeElement, bytes, duration, number } from './dom.js'
 import { get, id, watch, volumePath } from './api.js'
-import { Bar, badge, doing, left, ended, recipeText } from './state.js'
+import { Bar, badge, doing, left, ended, recipeText, volumeText } from './state.js'
 import { reconstructAgain } from './form.js'
 import { groups, valueText } from './parameters.js'
 import { t, t2, inSentence } from './lang.js'
@@ -95,6 +95,7 @@ export class ListPage {
 	#scanRows = new Map() /* id -> { state, element } */
 	#scansMost = scansFirst
 	#showing = 0 /* the last #show */
+	#newest = new Map() /* id of a running job -> its newest volume */
 	#abort = new AbortController()
 	#closed = false
 
@@ -159,6 +160,7 @@ export class ListPage {
 			const text = this.search.value.trim()
 			const [open, done, scans, limits] = await Promise.all([this.#list(['waiting', 'queued', 'running'], { limit: 1000 }), this.#list(['succeeded', 'failed', 'cancelled'], { limit: pageSize }),
 				get('/v1/scans?limit=1000', this.#abort.signal), get('/v1/limits', this.#abort.signal)])
+			this.#newest = new Map(await Promise.all(open.jobs.filter(job => job.state === 'running').map(async job => [job.id, await this.#newestOf(job)])))
 			this.#open = open.jobs
 			this.#jobs = done.jobs
 			if (this.#older.length === 0)
@@ -173,6 +175,11 @@ export class ListPage {
 			replace(this.trouble, error.status ? error.message : t('The daemon cannot be reached; this page goes on by itself once it answers again.'))
 			this.trouble.hidden = false
 		}
+	}
+
+	/* undefined where there is none, or the job has gone meanwhile. */
+	async #newestOf(job) {
+		return (await get(`/v1/jobs/${id(job.id)}/volumes?limit=1`, this.#abort.signal).catch(() => ({ volumes: [] }))).volumes[0]
 	}
 
 	async #fetchMore() {
@@ -192,7 +199,7 @@ export class ListPage {
 		const apart = await differences(all, wanted)
 		const make = job => {
 			const row = this.#rows.get(job.id) ?? new Row()
-			row.show(job, this.#scans.get(job.scan), apart.get(job.id))
+			row.show(job, this.#scans.get(job.scan), apart.get(job.id), this.#newest.get(job.id))
 			rows.set(job.id, row)
 		}
 		if (apart === null || !await inPieces(all, make, wanted))
@@ -256,7 +263,7 @@ export class ListPage {
 export const nameOf = scan => scan.name || t('Scan {id}', { id: scan.id })
 
 class Row {
-	#picture = ''
+	#picture = null
 
 	constructor() {
 		this.thumb = h('div', { class: 'thumb' })
@@ -272,7 +279,7 @@ class Row {
 		this.element = h('li', {}, this.link)
 	}
 
-	show(job, scan, apart) {
+	show(job, scan, apart, newest) {
 		this.link.href = `#/jobs/${id(job.id)}`
 		write(this.name, scan ? nameOf(scan) : t('Scan {id}', { id: job.scan }))
 		if (this.badge.dataset.state !== job.state) {
@@ -288,10 +295,17 @@ class Row {
 		}
 		this.bar.element.hidden = ended(job)
 		this.bar.show(job)
-		const picture = job.state === 'succeeded' ? `${volumePath(job.id, 'final')}/slice?axis=z` : ''
-		if (picture !== this.#picture) {
-			this.#picture = picture
-			replace(this.thumb, picture ? h('img', { src: picture, alt: '', loading: 'lazy', width: 160, height: 160 }) : null)
-		}
+		this.#showPicture(job, job.state === 'succeeded' ? { name: 'final' } : job.state === 'running' ? newest : undefined)
+	}
+
+	/* The volume's middle plane; of a running job it says which iteration that is of. */
+	#showPicture(job, volume) {
+		const text = !volume ? ended(job) ? t('no picture') : t('no picture yet') : job.state === 'running' ? volumeText(volume) : ''
+		const source = volume ? `${volumePath(job.id, volume.name)}/slice?axis=z` : '', picture = `${source} ${text}`
+		if (picture === this.#picture)
+			return
+		this.#picture = picture
+		this.thumb.classList.toggle('none', !volume)
+		replace(this.thumb, volume && h('img', { src: source, alt: '', loading: 'lazy', width: 160, height: 160 }), text !== '' && h('span', { class: 'of' }, text))
 	}
 }

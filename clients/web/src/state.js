@@ -69,6 +69,9 @@ export function recipeText(job) {
 		.filter(Boolean).join(' + ')
 }
 
+/* What a kept volume is of. */
+export const volumeText = volume => volume.iteration > 0 ? t('iteration {n}', { n: volume.iteration }) : volume.stage === 'tv' ? t('FDK and TV') : 'FDK'
+
 export class Bar {
 	constructor(label) {
 		this.fill = h('div', { class: 'fill' })

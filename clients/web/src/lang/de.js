@@ -250,6 +250,8 @@ export const strings = {
 	'feet first, on the left side': 'Füße voran, auf der linken Seite',
 	'feet first, on the right side': 'Füße voran, auf der rechten Seite',
 	'final': 'endgültig',
+	'no picture': 'kein Bild',
+	'no picture yet': 'noch kein Bild',
 	'full': 'voll',
 	'half': 'halb',
 	'head first, on the back': 'Kopf voran, auf dem Rücken',
