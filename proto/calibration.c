@@ -308,7 +308,7 @@ cJSON *matrices_json(const struct view *views, int count)
 		double matrix[12];
 
 		view_matrix(&views[k], matrix);
-		cJSON_AddItemToArray(list, cJSON_CreateDoubleArray(matrix, 12));
+		json_append(list, cJSON_CreateDoubleArray(matrix, 12));
 	}
 	return geometry;
 }
@@ -356,12 +356,12 @@ cJSON *calibration_json(const struct calibration *calibration)
 		const struct ball *ball = &calibration->balls.ball[b];
 		const double numbers[4] = {ball->centre[0], ball->centre[1], ball->centre[2], ball->diameter};
 
-		cJSON_AddItemToArray(list, cJSON_CreateDoubleArray(numbers, 4));
+		json_append(list, cJSON_CreateDoubleArray(numbers, 4));
 	}
 	list = cJSON_AddArrayToObject(json, "views");
 	for (int k = 0; k < calibration->count; k++) {
 		views[k] = calibration->views[k].view;
-		cJSON_AddItemToArray(list, view_json(&calibration->views[k]));
+		json_append(list, view_json(&calibration->views[k]));
 	}
 	json_add(json, "geometry", matrices_json(views, calibration->count));
 	free(views);

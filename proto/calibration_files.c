@@ -256,7 +256,7 @@ static void note(cJSON *notes, const char *code, const char *format, ...)
 	va_end(arguments);
 	cJSON_AddStringToObject(entry, "code", code);
 	cJSON_AddStringToObject(entry, "detail", detail);
-	cJSON_AddItemToArray(notes, entry);
+	json_append(notes, entry);
 }
 
 /* Another detector is taken to stand with its middle where the calibrated one has it. */

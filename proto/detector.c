@@ -148,7 +148,7 @@ cJSON *lag_json(const struct lag_model *model)
 
 		cJSON_AddNumberToObject(term, "share", model->terms[i].share);
 		cJSON_AddNumberToObject(term, "frames", model->terms[i].frames);
-		cJSON_AddItemToArray(list, term);
+		json_append(list, term);
 	}
 	return list;
 }
@@ -169,7 +169,7 @@ cJSON *scatter_json(const struct scatter_model *model)
 			cJSON_AddNumberToObject(kernel, kernel_numbers[i].name,
 						*(const double *)(const void *)((const char *)&model->kernels[k] +
 										kernel_numbers[i].offset));
-		cJSON_AddItemToArray(list, kernel);
+		json_append(list, kernel);
 	}
 	return object;
 }

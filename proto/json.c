@@ -507,6 +507,14 @@ bool json_add(cJSON *object, const char *name, cJSON *value)
 	return false;
 }
 
+bool json_append(cJSON *list, cJSON *value)
+{
+	if (value != NULL && cJSON_AddItemToArray(list, value))
+		return true;
+	cJSON_Delete(value);
+	return false;
+}
+
 struct printer {
 	char *text;
 	size_t length, room;
@@ -944,15 +952,12 @@ cJSON *json_runs(const unsigned char *flags, int count, bool value)
 
 	for (int i = 0; i < count && runs != NULL; i++) {
 		int first = i;
-		cJSON *run;
 
 		if ((flags[i] != 0) != value)
 			continue;
 		while (i + 1 < count && (flags[i + 1] != 0) == value)
 			i++;
-		run = cJSON_CreateDoubleArray((double[]){first, i}, 2);
-		if (run == NULL || !cJSON_AddItemToArray(runs, run)) {
-			cJSON_Delete(run);
+		if (!json_append(runs, cJSON_CreateDoubleArray((double[]){first, i}, 2))) {
 			cJSON_Delete(runs);
 			return NULL;
 		}
@@ -966,7 +971,7 @@ static void add_warning_views(cJSON *warning, const struct warning_views *views)
 	cJSON *list = cJSON_AddArrayToObject(warning, "views");
 
 	for (int i = 0; i < views->ranges; i++)
-		cJSON_AddItemToArray(list, cJSON_CreateIntArray(views->range[i], 2));
+		json_append(list, cJSON_CreateIntArray(views->range[i], 2));
 	cJSON_AddNumberToObject(warning, "view_count", views->count);
 	cJSON_AddNumberToObject(warning, "left_out", views->left_out);
 	cJSON_AddNumberToObject(warning, "mended", views->mended);

@@ -35,8 +35,10 @@ int json_parse(const char *text, size_t length, cJSON **ret_value, struct error 
  */
 char *json_print(const cJSON *value, size_t *ret_length /* may be NULL */);
 
-/* Adds a value that is the caller's no longer, whatever comes of it; false for no memory, or no value. */
+/* Adds a value that is the caller's no longer, whatever comes of it; false for no memory, no value, or no object. */
 bool json_add(cJSON *object, const char *name, cJSON *value);
+/* The same at the end of a list. cJSON's own leaves the value to a caller whose list there was no memory for. */
+bool json_append(cJSON *list, cJSON *value);
 
 /*
  * cJSON leaves a member out without a word where there is no memory for it. It is remembered, for each thread: the next

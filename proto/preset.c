@@ -6,6 +6,7 @@
 #include <string.h>
 
 #include "core/recon/algorithm.h"
+#include "proto/json.h"
 
 const struct job_preset job_presets[JOB_PRESET_COUNT] = {
     {"preview", "The first picture: FDK alone, there when the last projection is.", "{\"fdk\":{}}"},
@@ -67,7 +68,7 @@ static void take_stages(cJSON *request, cJSON *stages)
 		    (own_algorithm && is_algorithm(stage->string)))
 			continue;
 		cJSON_DetachItemViaPointer(stages, stage);
-		cJSON_AddItemToArray(request, stage); /* under its own name */
+		json_append(request, stage); /* under its own name */
 	}
 }
 

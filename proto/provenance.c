@@ -70,7 +70,7 @@ cJSON *provenance_json(const struct provenance *provenance, const char *unit)
 
 			if (column < 3)
 				last = row < 3 ? patient->rotation[row][column] : 0;
-			cJSON_AddItemToArray(matrix, cJSON_CreateNumber(last));
+			json_append(matrix, cJSON_CreateNumber(last));
 		}
 	}
 	if (provenance->recipe != NULL)

@@ -389,9 +389,7 @@ static bool add_emit(cJSON *document, const struct recipe *recipe)
 			      : one == EMIT_FDK_TV ? cJSON_CreateString("fdk-tv")
 						   : cJSON_CreateNumber(one);
 
-		added = json != NULL && cJSON_AddItemToArray(emit, json);
-		if (!added)
-			cJSON_Delete(json);
+		added = json_append(emit, json);
 	}
 	return added;
 }
@@ -457,9 +455,7 @@ cJSON *job_request_json(const struct job_request *request)
 
 static bool add_row(cJSON *list, const struct parameter *parameter, const char *object, const void *record)
 {
-	cJSON *row = parameter_json(parameter, object, record);
-
-	return row != NULL && cJSON_AddItemToArray(list, row);
+	return json_append(list, parameter_json(parameter, object, record));
 }
 
 /* One row for each algorithm that has the parameter, where it is one of algorithms. */

@@ -78,7 +78,7 @@ cJSON *refined_json(const struct refined *refined)
 		cJSON_AddNumberToObject(view, "projection", refined->projections[k]);
 		json_add(view, "shift_mm", cJSON_CreateDoubleArray(refined->change[k], 3));
 		json_add(view, "turn_deg", cJSON_CreateDoubleArray(refined->change[k] + 3, 3));
-		cJSON_AddItemToArray(list, view);
+		json_append(list, view);
 	}
 	if (refinement->accepted && refined->kind == REFINE_GEOMETRY)
 		json_add(json, "geometry", matrices_json(refined->views, refined->count));

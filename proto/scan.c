@@ -86,9 +86,7 @@ static const double angle_most = 1e6; /* degrees, of a list */
 static bool add_rows(cJSON *list, const struct parameter *parameters, int count, const void *record)
 {
 	for (int i = 0; i < count; i++) {
-		cJSON *row = parameter_json(&parameters[i], NULL, record);
-
-		if (row == NULL || !cJSON_AddItemToArray(list, row))
+		if (!json_append(list, parameter_json(&parameters[i], NULL, record)))
 			return false;
 	}
 	return true;
@@ -714,8 +712,7 @@ cJSON *scan_derived(const struct scan *scan)
 	cJSON_AddBoolToObject(derived, "untilted", geometry_is_untilted(&scan->geometry));
 	pixel = cJSON_AddArrayToObject(derived, "pixel_at_isocentre_mm");
 	for (int i = 0; i < 2; i++)
-		cJSON_AddItemToArray(pixel,
-				     cJSON_CreateNumber(shown(orbit->pixel_at_isocentre[orbit->turned ? 1 - i : i])));
+		json_append(pixel, cJSON_CreateNumber(shown(orbit->pixel_at_isocentre[orbit->turned ? 1 - i : i])));
 	cJSON_AddNumberToObject(derived, "projection_bytes", (double)scan_projection_bytes(scan));
 	return derived;
 }
@@ -729,7 +726,7 @@ __attribute__((format(printf, 3, 4))) static void warn(cJSON *list, const char *
 	vsnprintf(detail, sizeof(detail), format, args);
 	va_end(args);
 	assert(warning_is_known(code));
-	cJSON_AddItemToArray(list, json_warning(code, detail));
+	json_append(list, json_warning(code, detail));
 }
 
 /* Warns of weights that follow from the arc and the detector's place, and of what they cannot mend. */

@@ -154,8 +154,8 @@ cJSON *send_volumes_json(const char *volumes)
 	list = cJSON_CreateArray();
 	snprintf(text, sizeof(text), "%s", volumes);
 	while (list != NULL && (one = strsep(&rest, ",")) != NULL)
-		cJSON_AddItemToArray(list, isdigit((unsigned char)one[0]) ? cJSON_CreateNumber(atoi(one))
-									  : cJSON_CreateString(one));
+		json_append(list,
+			    isdigit((unsigned char)one[0]) ? cJSON_CreateNumber(atoi(one)) : cJSON_CreateString(one));
 	return list;
 }
 
@@ -169,7 +169,7 @@ char *sends_text(const struct send_wish *wishes, int count)
 
 		cJSON_AddStringToObject(one, "to", wishes[i].to);
 		json_add(one, "volumes", send_volumes_json(wishes[i].volumes));
-		cJSON_AddItemToArray(list, one);
+		json_append(list, one);
 	}
 	text = json_print(list, NULL);
 	cJSON_Delete(list);

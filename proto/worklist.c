@@ -25,7 +25,7 @@ static void add_text(cJSON *entry, cJSON *not_read, const char *name, const char
 	if (value == NULL || value[0] == '\0')
 		return;
 	if (!is_readable(value)) {
-		cJSON_AddItemToArray(not_read, cJSON_CreateString(name));
+		json_append(not_read, cJSON_CreateString(name));
 		return;
 	}
 	snprintf(text, sizeof(text), "%s", value + strspn(value, " "));
@@ -41,9 +41,9 @@ static void add_date_and_time(cJSON *entry, cJSON *not_read, const char *date, c
 	struct subject start = {0};
 
 	if (date != NULL && date[0] != '\0' && !(is_readable(date) && subject_take(&start, STUDY_DATE, date)))
-		cJSON_AddItemToArray(not_read, cJSON_CreateString(names[STEP_DATE]));
+		json_append(not_read, cJSON_CreateString(names[STEP_DATE]));
 	if (time != NULL && time[0] != '\0' && !(is_readable(time) && subject_take(&start, STUDY_TIME, time)))
-		cJSON_AddItemToArray(not_read, cJSON_CreateString(names[STEP_TIME]));
+		json_append(not_read, cJSON_CreateString(names[STEP_TIME]));
 	add_text(entry, not_read, names[STEP_DATE], start.text[STUDY_DATE]);
 	add_text(entry, not_read, names[STEP_TIME], start.text[STUDY_TIME]);
 }
@@ -58,7 +58,7 @@ static void take_request(struct subject *who, cJSON *not_read, enum subject_fiel
 	if (is_readable(value) && subject_take(who, field, value))
 		return;
 	snprintf(name, sizeof(name), "%s.%s", subject_rows[field].object, subject_rows[field].name);
-	cJSON_AddItemToArray(not_read, cJSON_CreateString(name));
+	json_append(not_read, cJSON_CreateString(name));
 }
 
 cJSON *worklist_step(const char *const field[STEP_FIELD_COUNT], const char *const subject[STUDY_STEP_ID])
@@ -75,7 +75,7 @@ cJSON *worklist_step(const char *const field[STEP_FIELD_COUNT], const char *cons
 		if (is_readable(subject[i]) && subject_take(&who, (enum subject_field)i, subject[i]))
 			continue;
 		snprintf(name, sizeof(name), "%s.%s", subject_rows[i].object, subject_rows[i].name);
-		cJSON_AddItemToArray(not_read, cJSON_CreateString(name));
+		json_append(not_read, cJSON_CreateString(name));
 		whole &= i > STUDY_UID;
 	}
 	for (int i = 0; i < STEP_FIELD_COUNT && entry != NULL; i++)

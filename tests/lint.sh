@@ -110,6 +110,8 @@ found "who is outside of core/ uses the doors of its rooms" "$(grep -nE '#includ
 rule "mutexes are made by lock_init, with their rank" 'pthread_mutex_init' $(files daemon | grep -v '^daemon/lock\.c$')
 found "daemon/THREADS.md (>) has the locks of daemon/lock.h (<) in their order" \
 	"$(diff <(sed -nE 's/^\t(LOCK_[A-Z]+),.*/\1/p' daemon/lock.h) <(sed -nE 's/^\| (LOCK_[A-Z]+) .*/\1/p' daemon/THREADS.md))"
+rule "what goes into a list or an object goes by json_append and json_add" 'cJSON_AddItem(To|Ref)' \
+	$(files daemon proto | grep -v '^proto/json\.c$')
 rule "no process-wide string functions" '\b(strtok|sprintf|strcpy|strcat|gets|localtime|gmtime|strerror_l|rand|srand) *\(' $(files core proto daemon clients)
 rule "no unfinished work by its own words" '\b(TODO|FIXME|XXX|HACK)\b' $(files core kernels proto daemon clients tests)
 

@@ -94,15 +94,15 @@ static bool add_scatter(cJSON *document, struct stored_scan *scan, const struct 
 	missing = cJSON_AddArrayToObject(object, "missing");
 	for (int i = 0; i < scatter->count; i++)
 		if (flags[i] == 0)
-			cJSON_AddItemToArray(
-			    missing, cJSON_CreateNumber(scatter_image_projection(&scatter->images, facts->count, i)));
+			json_append(missing,
+				    cJSON_CreateNumber(scatter_image_projection(&scatter->images, facts->count, i)));
 	free(flags);
 	return true;
 }
 
 static void add_warning(cJSON *list, const char *code, const char *detail)
 {
-	cJSON_AddItemToArray(list, json_warning(code, detail));
+	json_append(list, json_warning(code, detail));
 }
 
 static bool lacks_flat(const struct scan_facts *facts)
@@ -347,25 +347,25 @@ static void add_waiting_for(cJSON *document, const struct scan_facts *scan, cons
 
 	if (record->state == JOB_WAITING && scan != NULL) {
 		if (lacks_flat(scan))
-			cJSON_AddItemToArray(list, cJSON_CreateString("flat"));
+			json_append(list, cJSON_CreateString("flat"));
 		for (int i = 0; i < IMAGE_COUNT; i++) {
 			if (scan->lost_image[i])
-				cJSON_AddItemToArray(list, cJSON_CreateString(image_kinds[i].name));
+				json_append(list, cJSON_CreateString(image_kinds[i].name));
 		}
 		if (!scan->complete)
-			cJSON_AddItemToArray(list, cJSON_CreateString("projections"));
+			json_append(list, cJSON_CreateString("projections"));
 		if (scan->scatter.wanted > 0)
-			cJSON_AddItemToArray(list, cJSON_CreateString("scatter"));
+			json_append(list, cJSON_CreateString("scatter"));
 		if (!scan->checked)
-			cJSON_AddItemToArray(list, cJSON_CreateString("check"));
+			json_append(list, cJSON_CreateString("check"));
 	}
 	if (obstacle != JOB_UNHINDERED)
-		cJSON_AddItemToArray(list, cJSON_CreateString(job_obstacle_names[obstacle]));
+		json_append(list, cJSON_CreateString(job_obstacle_names[obstacle]));
 	else if (record->state == JOB_QUEUED)
-		cJSON_AddItemToArray(list, cJSON_CreateString("worker"));
+		json_append(list, cJSON_CreateString("worker"));
 	job_wait_text(job, text);
 	if (text[0] != '\0' && obstacle != JOB_NO_HOST)
-		cJSON_AddItemToArray(list, cJSON_CreateString(job_obstacle_names[JOB_NO_HOST]));
+		json_append(list, cJSON_CreateString(job_obstacle_names[JOB_NO_HOST]));
 	add_text_or_null(document, "waiting_detail", text);
 }
 
@@ -376,7 +376,7 @@ static void add_ran_on(cJSON *document, const char *text)
 	char *end;
 
 	for (const char *at = text; *at != '\0'; at = *end == ',' ? end + 1 : end)
-		cJSON_AddItemToArray(list, cJSON_CreateNumber((double)strtol(at, &end, 10)));
+		json_append(list, cJSON_CreateNumber((double)strtol(at, &end, 10)));
 }
 
 static int add_job_facts(cJSON *document, struct job *job, const struct job_record *record, struct error *err)
@@ -480,7 +480,7 @@ static int add_sendings(cJSON *document, struct job *job, struct error *err)
 		return code;
 	list = cJSON_AddArrayToObject(document, "sendings");
 	for (int i = 0; i < count; i++)
-		cJSON_AddItemToArray(list, sending_document(&sendings[i]));
+		json_append(list, sending_document(&sendings[i]));
 	free(sendings);
 	return 0;
 }
@@ -495,7 +495,7 @@ static int add_history(cJSON *document, struct store *store, const char *id, str
 		return code;
 	list = cJSON_AddArrayToObject(document, "history");
 	for (int i = 0; i < count; i++)
-		cJSON_AddItemToArray(list, history_row_document(&rows[i]));
+		json_append(list, history_row_document(&rows[i]));
 	free(rows);
 	return 0;
 }

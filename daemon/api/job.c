@@ -159,7 +159,7 @@ int job_list(void *context, struct request *request, struct error *err)
 		if (one == NULL)
 			code = err->code;
 		else
-			cJSON_AddItemToArray(list, one);
+			json_append(list, one);
 		job_facts(jobs[i], &last);
 		job_release(jobs[i]);
 	}

@@ -113,7 +113,7 @@ int scan_list(void *context, struct request *request, struct error *err)
 	document = cJSON_CreateObject();
 	list = cJSON_AddArrayToObject(document, "scans");
 	for (int i = 0; i < count; i++)
-		cJSON_AddItemToArray(list, scan_document(scans[i], true));
+		json_append(list, scan_document(scans[i], true));
 	if (more && count > 0)
 		cJSON_AddStringToObject(document, "next", stored_scan_id(scans[count - 1]));
 	else

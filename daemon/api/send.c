@@ -95,7 +95,7 @@ static int reply_sendings(struct request *request, int status, struct job *job, 
 	document = cJSON_CreateObject();
 	list = cJSON_AddArrayToObject(document, "sendings");
 	for (int i = 0; i < count; i++)
-		cJSON_AddItemToArray(list, sending_document(&sendings[i]));
+		json_append(list, sending_document(&sendings[i]));
 	free(sendings);
 	return request_reply_json(request, status, document, err);
 }

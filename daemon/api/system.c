@@ -88,7 +88,7 @@ int quarantine_get(void *context, struct request *request, struct error *err)
 	document = cJSON_CreateObject();
 	list = cJSON_AddArrayToObject(document, "entries");
 	for (int i = 0; i < count; i++)
-		cJSON_AddItemToArray(list, quarantined_document(&entries[i]));
+		json_append(list, quarantined_document(&entries[i]));
 	free(entries);
 	return request_reply_json(request, 200, document, err);
 }
@@ -101,7 +101,7 @@ int device_list(void *context, struct request *request, struct error *err)
 	cJSON *document = cJSON_CreateObject(), *list = cJSON_AddArrayToObject(document, "devices");
 
 	for (int i = 0; i < count && i < WORKERS_MAX; i++)
-		cJSON_AddItemToArray(list, worker_document(&workers[i]));
+		json_append(list, worker_document(&workers[i]));
 	return request_reply_json(request, 200, document, err);
 }
 

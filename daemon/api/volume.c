@@ -31,7 +31,7 @@ static int reply_page(struct request *request, const char *job, const struct pag
 	first = behind - 1;
 	last = first >= page->limit ? first - page->limit + 1 : 0;
 	for (int i = first; i >= last; i--)
-		cJSON_AddItemToArray(list, volume_document(job, &volumes[i]));
+		json_append(list, volume_document(job, &volumes[i]));
 	if (last > 0)
 		cJSON_AddStringToObject(document, "next", volumes[last].name);
 	else

@@ -89,7 +89,7 @@ static void add_scale_warning(cJSON *warnings, const cJSON *result)
 	    "far from the isocentre as the scan's geometry has them: the drawing may have another scale than the "
 	    "phantom",
 	    shadows, sources);
-	cJSON_AddItemToArray(warnings, json_warning("calibration_scale", detail));
+	json_append(warnings, json_warning("calibration_scale", detail));
 }
 
 static void add_view_warning(cJSON *warnings, const cJSON *result)
@@ -109,7 +109,7 @@ static void add_view_warning(cJSON *warnings, const cJSON *result)
 	}
 	snprintf(detail, sizeof(detail), "%d of %d views are not used, their places are between their neighbours': %s",
 		 count - used, count, why);
-	cJSON_AddItemToArray(warnings, json_warning("calibration_views", detail));
+	json_append(warnings, json_warning("calibration_views", detail));
 }
 
 static void add_warnings(cJSON *document, const cJSON *result)
@@ -126,14 +126,14 @@ static void add_warnings(cJSON *document, const cJSON *result)
 			 "the phantom looks about the same turned by %.0f degrees: it was taken to stand as near as "
 			 "possible to where the nominal geometry has it",
 			 number_of(result, "other_turn_deg"));
-		cJSON_AddItemToArray(warnings, json_warning("calibration_turn", detail));
+		json_append(warnings, json_warning("calibration_turn", detail));
 	}
 	if (fabs(number_of(result, "turned_deg")) > CALIBRATED_TURN_MOST * 180 / M_PI) {
 		snprintf(detail, sizeof(detail),
 			 "the phantom stood turned by %.1f degrees about z against its drawing, and so do the axes of "
 			 "scans that use this",
 			 number_of(result, "turned_deg"));
-		cJSON_AddItemToArray(warnings, json_warning("calibration_turned", detail));
+		json_append(warnings, json_warning("calibration_turned", detail));
 	}
 	add_view_warning(warnings, result);
 }

@@ -619,7 +619,7 @@ int calibrations_list(struct calibrations *calibrations, const char *after, int 
 	from = after != NULL ? place_of(calibrations, after) : calibrations->count;
 	*ret_more = from > limit;
 	for (int i = from - 1; i >= 0 && i >= from - limit; i--) {
-		cJSON_AddItemToArray(list, copy_brief(&calibrations->entries[i]));
+		json_append(list, copy_brief(&calibrations->entries[i]));
 		memcpy(ret_last, calibrations->entries[i].id, ID_SIZE);
 	}
 	pthread_mutex_unlock(&calibrations->lock);

@@ -69,7 +69,7 @@ static void note_age(const struct calibrations *calibrations, const struct calib
 		 calibrations->age);
 	cJSON_AddStringToObject(note, "code", "calibration_old");
 	cJSON_AddStringToObject(note, "detail", detail);
-	cJSON_AddItemToArray(notes, note);
+	json_append(notes, note);
 }
 
 int calibrations_find_views(void *context, const char *id, const struct scan *scan, const double *angles,

@@ -40,8 +40,7 @@ static cJSON *add_item(cJSON *list)
 {
 	cJSON *item = cJSON_CreateObject();
 
-	cJSON_AddItemToArray(list, item);
-	return item;
+	return json_append(list, item) ? item : NULL;
 }
 
 /* ---- N-CREATE ---- */

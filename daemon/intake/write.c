@@ -171,7 +171,7 @@ static int read_image(const struct upload *upload, enum image image, char **ret_
 
 static void add_warning(void *context, const char *code, const char *detail)
 {
-	cJSON_AddItemToArray(context, json_warning(code, detail));
+	json_append(context, json_warning(code, detail));
 }
 
 /* Refuses what every job would be refused for with the images that are there; what is doubtful goes to *ret_warnings.

@@ -45,7 +45,7 @@ static void devices_save(const struct supervise *supervise)
 		cJSON_AddNumberToObject(device, "device", supervise->devices[i]);
 		cJSON_AddNumberToObject(device, "since", supervise->workers[i].aside_since);
 		cJSON_AddStringToObject(device, "error", supervise->workers[i].last_error);
-		cJSON_AddItemToArray(list, device);
+		json_append(list, device);
 	}
 	devices_path(supervise, path);
 	if (sealed_write(path, document, &err) != 0)

@@ -367,7 +367,7 @@ void application_take(struct sendings *sendings, int transfer, const cJSON *line
 	if (transfer == TRANSFER_LISTENER)
 		take_listener(sendings, line);
 	else if (cJSON_IsObject(step) && cJSON_GetArraySize(sendings->steps) < WORKLIST_MOST)
-		cJSON_AddItemToArray(sendings->steps, cJSON_Duplicate(step, true));
+		json_append(sendings->steps, cJSON_Duplicate(step, true));
 	else if (step != NULL)
 		sendings->worklist.nobodys++;
 }

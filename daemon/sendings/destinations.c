@@ -317,7 +317,7 @@ cJSON *destinations_document(struct sendings *sendings)
 
 	pthread_mutex_lock(&sendings->lock);
 	for (int i = 0; i < sendings->destination_count; i++)
-		cJSON_AddItemToArray(list, document_of(sendings, &sendings->destinations[i]));
+		json_append(list, document_of(sendings, &sendings->destinations[i]));
 	pthread_mutex_unlock(&sendings->lock);
 	return document;
 }

@@ -105,7 +105,7 @@ static int add_kept(struct sendings *sendings, cJSON *list, struct job *job, con
 		cJSON_Delete(kept);
 		return err->code == ERR_NOT_FOUND ? 0 : err->code;
 	}
-	cJSON_AddItemToArray(list, kept);
+	json_append(list, kept);
 	return 0;
 }
 

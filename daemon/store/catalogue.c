@@ -458,9 +458,8 @@ static int export_row(void *context, const struct value *values, struct error *e
 	const struct exported *exported = context;
 	cJSON *object = json_of_row(exported->table, values);
 
-	if (object != NULL && cJSON_AddItemToArray(exported->list, object))
+	if (json_append(exported->list, object))
 		return 0;
-	cJSON_Delete(object);
 	return error_set_errno(err, ENOMEM, "rows of %s", exported->table->name);
 }
 

@@ -278,7 +278,7 @@ int ledger_tell(struct ledger *ledger, const char (*ids)[ID_SIZE], int count, st
 	int code;
 
 	for (int i = 0; i < count; i++)
-		cJSON_AddItemToArray(list, cJSON_CreateString(ids[i]));
+		json_append(list, cJSON_CreateString(ids[i]));
 	text = list == NULL || cJSON_GetArraySize(list) != count ? NULL : json_print(list, NULL);
 	cJSON_Delete(list);
 	if (text == NULL)
@@ -377,7 +377,7 @@ static char *print_offers(const struct offer *offers, int count)
 		cJSON_AddStringToObject(row, "host", offers[i].where.host);
 		cJSON_AddNumberToObject(row, "memory", offers[i].where.memory);
 		cJSON_AddNumberToObject(row, "devices", (double)offers[i].where.devices);
-		cJSON_AddItemToArray(list, row);
+		json_append(list, row);
 	}
 	text = list == NULL || cJSON_GetArraySize(list) != count ? NULL : json_print(list, NULL);
 	cJSON_Delete(list);

@@ -6,6 +6,7 @@
 #include <stdlib.h>
 #include <string.h>
 
+#include "proto/detector.h"
 #include "proto/json.h"
 #include "tests/unit/documents.h"
 
@@ -338,6 +339,39 @@ START_TEST(print_refuses_a_tree_that_lacks_something)
 }
 END_TEST
 
+static int allocations, fails_at, blocks;
+
+static void *allocate_but_one(size_t size)
+{
+	if (++allocations == fails_at)
+		return NULL;
+	blocks++;
+	return malloc(size);
+}
+
+static void give_back(void *memory)
+{
+	blocks -= memory != NULL;
+	free(memory);
+}
+
+/* Wherever memory runs out once: in a list, in what is to go into it, or before both. */
+START_TEST(a_tree_that_lacks_something_is_freed_whole)
+{
+	const struct scatter_model model = {.count = 2};
+
+	cJSON_InitHooks(&(cJSON_Hooks){.malloc_fn = allocate_but_one, .free_fn = give_back});
+	do {
+		allocations = 0;
+		fails_at++;
+		cJSON_Delete(scatter_json(&model));
+		ck_assert_msg(blocks == 0, "%d blocks are left without the %d-th", blocks, fails_at);
+	} while (allocations >= fails_at);
+	cJSON_InitHooks(NULL);
+	ck_assert_int_gt(fails_at, 10);
+}
+END_TEST
+
 /* ---- the reader ---- */
 
 struct answers {
@@ -515,6 +549,7 @@ Suite *json_suite(void)
 	tcase_add_test(texts, every_finite_double_comes_back_the_same);
 	tcase_add_test(texts, print_is_always_json);
 	tcase_add_test(texts, print_refuses_a_tree_that_lacks_something);
+	tcase_add_test(texts, a_tree_that_lacks_something_is_freed_whole);
 	suite_add_tcase(suite, texts);
 	tcase_add_test(reader, reader_fills_what_is_there_and_leaves_the_rest);
 	tcase_add_test(reader, reader_refuses_by_pointer);
