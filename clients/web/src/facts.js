@@ -53,6 +53,10 @@ function parameterFacts(job) {
 	})
 }
 
+/* Why iterations ended that were left to the program, by the rule. */
+const stopReasons = () => ({ noise: t('the volume has taken up most of the projections\' noise'), residual: t('the last iteration explained next to nothing more of the projections'),
+	change: t('the last iteration changed next to nothing'), ceiling: t('more were not allowed') })
+
 export function jobFacts(job) {
 	const timings = job.timings ?? {}
 	const spent = ['waiting', 'queued', 'load', 'fdk', 'sart', 'cgls', 'fista', 'tv', 'save'].filter(name => timings[name] > 0.05).map(name => `${t(name)} ${duration(timings[name])}`)
@@ -62,7 +66,7 @@ export function jobFacts(job) {
 		[t('Noise'), job.denoising ? `${number(job.denoising.noise_hu)} HU` : null],
 		[t('Alpha found'), job.tv?.alpha === 'auto' && job.denoising ? (job.denoising.alpha === null ? t('nothing to smooth') : number(job.denoising.alpha)) : null],
 		[t('Geometry fits to'), job.geometry_agreement ? t('{mm} mm at the isocentre (one projection: ± {sigma} mm), {share} % of the detail elsewhere', { mm: number(job.geometry_agreement.mm, 2), sigma: number(job.geometry_agreement.sigma_mm, 2), share: Math.round(100 * job.geometry_agreement.unexplained) }) : null],
-		[t('Ended after'), job.stopped ? t('{n} iterations: {why}', { n: job.stopped.iteration, why: job.stopped.reason }) : null],
+		[t('Ended after'), job.stopped ? t('{n} iterations: {why}', { n: job.stopped.iteration, why: stopReasons()[job.stopped.rule] ?? job.stopped.reason }) : null],
 		[t('Runs on'), job.ran_on?.length > 1 ? t('{device} ({backend}), devices {list}', { device: job.device, backend: job.backend, list: job.ran_on.join(', ') }) : job.device ? `${job.device} (${job.backend})` : job.backend],
 		[t('Memory'), job.memory ? bytes(job.memory.total) : null],
 		[t('Asked for'), timeElement(job.created)],
