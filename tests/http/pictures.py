@@ -15,10 +15,11 @@ import sys
 import time
 import urllib.parse
 import urllib.request
-from typing import Dict, List, Tuple
+from typing import Dict, Tuple
 
 PATIENCE = 900  # s for what must come
 GONE, LIVE, WAITING_CLIENT_MAX = 300, 20, 128
+PLACES = min(len(os.sched_getaffinity(0)), 8)  # of one client; there is one more
 
 url, unix_socket, volume, scan, hold = sys.argv[1:6]
 address = urllib.parse.urlsplit(url)
@@ -83,17 +84,15 @@ def flood() -> None:
     before = counts()
     holding(True)
     live = [Client(i) for i in range(LIVE)]
-    now = until(lambda n: n["drawing"] + n["waiting"] == LIVE, f"{LIVE} pictures")
-    places = now["drawing"]
-    expect(1 <= places <= min(len(os.sched_getaffinity(0)), 8), f"as many drawings as processors, got {places}")
+    until(lambda n: n["drawing"] == PLACES and n["waiting"] == LIVE - PLACES, f"{LIVE} pictures, {PLACES} of them being drawn")
     for i in range(GONE):
         Client(i).socket.close()
     all_gone = lambda n: n["waiting"] + n["gone"] + n["drawing"] == before["gone"] + LIVE + GONE
     now = until(all_gone, f"{LIVE + GONE} pictures")
-    expect(now["drawing"] == places and now["drawn"] == before["drawn"], f"{places} drawings, none ended, got {now}")
+    expect(now["drawing"] == PLACES and now["drawn"] == before["drawn"], f"{PLACES} drawings, none ended, got {now}")
     # The place that is left is for other clients, as a user of the Unix socket is one.
     other = Client(1, unix_socket)
-    until(lambda n: n["drawing"] == places + 1, "a drawing of another client beside them")
+    until(lambda n: n["drawing"] == PLACES + 1, "a drawing of another client beside them")
     holding(False)
     for client in live + [other]:
         status, headers, body = client.reply()
@@ -101,7 +100,7 @@ def flood() -> None:
     now = until(lambda n: n["drawing"] + n["waiting"] == 0, "all at an end")
     made = {how: now[how] - before[how] for how in ("drawn", "gone", "refused", "failed")}
     expect(made == {"drawn": LIVE + 1, "gone": GONE, "refused": 0, "failed": 0}, f"only pictures of who is there, got {made}")
-    print(f"  {places} places of one client; {made}")
+    print(f"  {PLACES} places of one client; {made}")
 
 
 def served_meanwhile() -> None:
@@ -126,12 +125,10 @@ def full() -> None:
     """One too many is told so, and when to come again."""
     before = counts()
     holding(True)
-    clients: List[Client] = []
-    now = before
-    while now["waiting"] < WAITING_CLIENT_MAX:
-        missing = WAITING_CLIENT_MAX - now["waiting"]
-        clients += [Client(len(clients) + i) for i in range(missing)]
-        now = until(lambda n: n["drawing"] + n["waiting"] == len(clients), f"{len(clients)} pictures")
+    clients = [Client(i) for i in range(PLACES)]
+    until(lambda n: n["drawing"] == PLACES, f"{PLACES} being drawn")
+    clients += [Client(i) for i in range(WAITING_CLIENT_MAX)]
+    until(lambda n: n["waiting"] == WAITING_CLIENT_MAX, f"{WAITING_CLIENT_MAX} that wait")
     for _ in range(3):
         status, headers, body = Client(0).reply()
         told = json.loads(body)
