@@ -85,8 +85,9 @@ static int take_view(const struct correction_job *job, void *opaque, const struc
 }
 
 /* Views that opposite ones contradict, whatever the object is. */
-static bool tell_opposite(const struct correction_job *job, const struct opposite_rays *rays, double bin)
+static bool tell_opposite(const struct correction_job *job, const struct agreement *agreement, double bin)
 {
+	const struct opposite_rays *rays = &agreement->rays;
 	const double given = sqrt(rays->square[OPPOSITE_GIVEN]);
 
 	if (opposite_rays_other_way(rays))
@@ -102,7 +103,7 @@ static bool tell_opposite(const struct correction_job *job, const struct opposit
 			     "line integrals of the %d rays that two views share differ by %.2g (root mean square) as "
 			     "the geometry says, and by %.2g if the detector is displaced to the other side",
 			     rays->pairs[OPPOSITE_GIVEN], given, sqrt(rays->square[OPPOSITE_OTHER_SIDE]));
-	else if (opposite_rays_aside(rays))
+	else if (agreement_is_aside(agreement, bin))
 		warning_tell(job->warnings, "geometry_wrong",
 			     "line integrals of the %d rays that two views share differ by %.2g (root mean square) as "
 			     "the geometry says, and by %.2g if all detectors stand aside by %.3g mm at the isocentre, "
@@ -118,7 +119,7 @@ static void tell(const struct correction_job *job, const struct agreement *agree
 {
 	const enum agreement_grade grade = agreement_grade(agreement, bin);
 
-	if (grade == AGREEMENT_GOOD || tell_opposite(job, &agreement->rays, bin))
+	if (grade == AGREEMENT_GOOD || tell_opposite(job, agreement, bin))
 		return;
 	if (agreement->mm < UNSEEN_MM) {
 		warning_tell(job->warnings, "geometry_wrong",

@@ -26,8 +26,12 @@
  * share of it that is unexplained tells. Not so where the object is wider than the detector: what is beyond the field
  * of view is in no half's volume, and its detail stays unexplained by any geometry.
  *
+ * A body that the detector cuts off, or a plate whose faces lie along the rays, moves a part of a view against its
+ * reprojection and not the rest. Therefore a shift counts where the view without any quarter or half of its columns or
+ * rows still says it, or where the rays that opposite views share agree better with the views moved by it.
+ *
  * Large departures of all views, an arm that turned the other way and a detector far aside, are told by the rays that
- * opposite views have in common (opposite.h), which need no volume.
+ * opposite views have in common (opposite.h), which need no volume. Of scans of 32 to 63 views nothing else is asked.
  */
 enum { AGREEMENT_VIEWS_MOST = 120, AGREEMENT_BINS_MOST = 80 };
 
@@ -35,6 +39,7 @@ struct view_agreement {
 	bool measured;      /* the view shows enough detail */
 	double shift[2];    /* mm at the isocentre, along columns and rows */
 	double sigma[2];    /* standard deviations that these have by what the fit leaves unexplained */
+	double doubt[2];    /* and by what parts of the view say (shift.h) */
 	double unexplained; /* share of the view's detail that the others do not show there */
 };
 
@@ -43,7 +48,10 @@ struct agreement {
 	double mm;       /* at the isocentre: root mean square over the views, without the part that sigma explains */
 	double sigma_mm; /* root mean square of the sigmas */
 	double unexplained; /* median of the views' shares */
-	int worst;          /* number of the view, in the scan, that lies aside most */
+	double mean[2];     /* of the shifts, mm */
+	/* Root mean square of the shifts over that of the doubts, along columns or rows, whichever is more. */
+	double firm;
+	int worst; /* number of the view, in the scan, that lies aside most */
 	double worst_mm;
 	bool cut;        /* the object is wider than the detector: nothing follows from what is unexplained */
 	bool short_scan; /* of the orbit; both raise what is told of a geometry that lies aside */
@@ -63,6 +71,9 @@ void agreement_clear(struct agreement *agreement);
 
 /* True if so many views could be measured that the numbers say something of the scan. */
 bool agreement_is_known(const struct agreement *agreement);
+/* True if detectors all stand aside by opposite views, and nearly so by the others where that is less than some bins.
+ */
+bool agreement_is_aside(const struct agreement *agreement, double bin);
 /*
  * What the numbers mean, bin: mm at the isocentre (reduced_bin). The limits were found on exact line integrals of
  * heads, knees with screws, hands, even cylinders and truncated abdomens, without noise and with 20,000 and 2,000

@@ -13,6 +13,9 @@ static const double FAR_ASIDE = 3;
  * makes 4 of it less than once in a million times. What explains nearly as much is held to be possible.
  */
 static const double SMALLER = 4, NEARLY = 2, FAR_SMALLER = 8;
+/* The same where views lie aside as well, by all and by each of the shifts found: what fits was at most 1.2
+ * and .8 times better. */
+static const double NEAR_SMALLER = 3, SHIFTED_SMALLER = 1.25, NEITHER[2] = {0};
 /* The share of the integrals below which differences come from the bins' width, and say nothing. */
 static const double SHARE_LEAST = 0.005;
 /* Differences of integrals that have nothing to do with each other are twice their mean square. */
@@ -79,22 +82,29 @@ struct comparison {
 	double from, to, row;
 };
 
-static struct comparison compare(const struct reduced *reduced, double (*matrices)[12], double aside)
+/* shifts: of each view beside `aside`, or NULL; axes: which of them count, those along columns and along rows. */
+static struct comparison compare(const struct reduced *reduced, double (*matrices)[12], double aside,
+				 const double (*shifts)[2], const double axes[2])
 {
+	static const double nowhere[2] = {0};
 	const struct geometry *geometry = &reduced->geometry;
 	struct comparison sums = {.from = geometry->columns, .to = 0};
 
 	for (int i = 0; i < geometry->count; i++)
 		for (int j = i + 1; j < geometry->count && reduced->known[i]; j++) {
 			const double *const from = geometry->views[i].source, *const to = geometry->views[j].source;
+			const double *const first = shifts != NULL ? shifts[i] : nowhere;
+			const double *const second = shifts != NULL ? shifts[j] : nowhere;
 			double column[2], row[2], value[2];
 
 			/* Neighbours see each other nowhere; opposite sources are in front of each other. */
 			if (!reduced->known[j] || vec_dot(from, to) > 0 ||
 			    !(view_project(matrices[i], to, &column[0], &row[0]) > 0) ||
 			    !(view_project(matrices[j], from, &column[1], &row[1]) > 0) ||
-			    !sample(reduced, i, column[0] + aside, row[0], &value[0]) ||
-			    !sample(reduced, j, column[1] + aside, row[1], &value[1]))
+			    !sample(reduced, i, column[0] + aside + axes[0] * first[0], row[0] + axes[1] * first[1],
+				    &value[0]) ||
+			    !sample(reduced, j, column[1] + aside + axes[0] * second[0], row[1] + axes[1] * second[1],
+				    &value[1]))
 				continue;
 			sums.difference += pow(value[0] - value[1], 2);
 			sums.integral += (pow(value[0], 2) + pow(value[1], 2)) / 2;
@@ -140,7 +150,7 @@ static void compare_aside(const struct reduced *reduced, double (*matrices)[12],
 	rays->least_share = rays->share[OPPOSITE_GIVEN];
 	rays->aside = 0;
 	for (int i = -ASIDE_STEPS; i <= ASIDE_STEPS; i++) {
-		const struct comparison at = compare(reduced, matrices, i * ASIDE_STEP);
+		const struct comparison at = compare(reduced, matrices, i * ASIDE_STEP, NULL, NEITHER);
 
 		if (2 * at.pairs <= rays->pairs[OPPOSITE_GIVEN] || share_of(&at, all) >= rays->least_share)
 			continue;
@@ -150,8 +160,24 @@ static void compare_aside(const struct reduced *reduced, double (*matrices)[12],
 	}
 }
 
-int opposite_rays_compare(const struct reduced *reduced, const double axis[3], struct opposite_rays *ret_rays,
-			  struct error *err)
+/* The least share with the shifts along columns, along rows, and both: truncation spoils one of them and not the other.
+ */
+static double least_shifted(const struct reduced *reduced, double (*matrices)[12], double all,
+			    const double (*shifts)[2])
+{
+	static const double axes[][2] = {{1, 0}, {0, 1}, {1, 1}};
+	double least = NOTHING_SHOWN;
+
+	for (int i = 0; i < 3 && shifts != NULL; i++) {
+		const struct comparison found = compare(reduced, matrices, 0, shifts, axes[i]);
+
+		least = fmin(least, share_of(&found, all));
+	}
+	return least;
+}
+
+int opposite_rays_compare(const struct reduced *reduced, const double axis[3], const double (*shifts)[2],
+			  struct opposite_rays *ret_rays, struct error *err)
 {
 	const struct geometry *geometry = &reduced->geometry;
 	double(*matrices)[12] = malloc((size_t)geometry->count * sizeof(*matrices));
@@ -168,7 +194,7 @@ int opposite_rays_compare(const struct reduced *reduced, const double axis[3], s
 
 			view_matrix(&view, matrices[k]);
 		}
-		found = compare(reduced, matrices, 0);
+		found = compare(reduced, matrices, 0, NULL, NEITHER);
 		ret_rays->pairs[which] = found.pairs;
 		ret_rays->square[which] = found.difference;
 		if (which == OPPOSITE_GIVEN && found.pairs > 0)
@@ -179,6 +205,7 @@ int opposite_rays_compare(const struct reduced *reduced, const double axis[3], s
 		ret_rays->noticed = found.pairs > 0 && ret_rays->share[which] > pow(SHARE_LEAST, 2);
 		ret_rays->empty = found.pairs > 0 && shown(reduced, found.row, found.from, found.to) < EMPTY * all;
 		compare_aside(reduced, matrices, all, ret_rays);
+		ret_rays->shifted_share = least_shifted(reduced, matrices, all, shifts);
 	}
 	free(matrices);
 	return 0;
@@ -224,4 +251,15 @@ bool opposite_rays_aside(const struct opposite_rays *rays)
 {
 	return rays->noticed && is_given_shown(rays) && fabs(rays->aside) >= FAR_ASIDE &&
 	       FAR_SMALLER * rays->least_share < rays->share[OPPOSITE_GIVEN];
+}
+
+bool opposite_rays_near_aside(const struct opposite_rays *rays)
+{
+	return rays->noticed && is_given_shown(rays) && NEAR_SMALLER * rays->least_share < rays->share[OPPOSITE_GIVEN];
+}
+
+bool opposite_rays_shifted(const struct opposite_rays *rays)
+{
+	return rays->noticed && is_given_shown(rays) &&
+	       SHIFTED_SMALLER * rays->shifted_share < rays->share[OPPOSITE_GIVEN];
 }

@@ -36,11 +36,15 @@ struct opposite_rays {
 	bool noticed; /* the differences for the given geometry are large enough that another one may be looked for */
 	/* The least for detectors that all stand aside of the given geometry by the same, and bins by which they do. */
 	double least, least_share, aside;
+	double shifted_share; /* for the given geometry, each view moved by what was found for it */
 };
 
-/* axis: the orbit's, a unit vector. ERR_NO_MEMORY is the only error. The same bits for any number of threads. */
-int opposite_rays_compare(const struct reduced *reduced, const double axis[3], struct opposite_rays *ret_rays,
-			  struct error *err);
+/*
+ * axis: the orbit's, a unit vector. shifts: [view][2], bins along columns and rows by which a view's image lies aside,
+ * or NULL. ERR_NO_MEMORY is the only error. The same bits for any number of threads.
+ */
+int opposite_rays_compare(const struct reduced *reduced, const double axis[3], const double (*shifts)[2],
+			  struct opposite_rays *ret_rays, struct error *err);
 
 /* True if the other way round, or mirrored columns, explain what the given geometry does not, and nothing else does. */
 bool opposite_rays_other_way(const struct opposite_rays *rays);
@@ -48,5 +52,9 @@ bool opposite_rays_other_way(const struct opposite_rays *rays);
 bool opposite_rays_displaced(const struct opposite_rays *rays);
 /* True if detectors that stand far aside, all by the same, explain what the given geometry does not. */
 bool opposite_rays_aside(const struct opposite_rays *rays);
+/* True if they explain it standing aside by some part of a bin, too, as an uneven flat may look like. */
+bool opposite_rays_near_aside(const struct opposite_rays *rays);
+/* True if the views moved by their shifts agree better than as they are. */
+bool opposite_rays_shifted(const struct opposite_rays *rays);
 
 #endif

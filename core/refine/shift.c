@@ -13,7 +13,7 @@
 #include "core/select.h"
 
 /* The edge's last value, repeated, makes detail as far as BORDER, which may be that of a body wider than the image. */
-enum { UNKNOWNS = 5, PASSES = 4, EDGE = 3, BORDER = 8 };
+enum { UNKNOWNS = 5, PASSES = 4, EDGE = 3, BORDER = 8, STRIPS = 4 };
 static const double PI = 3.14159265358979323846;
 /* Standard deviations of the two Gaussians between which detail counts, bins. */
 static const double FINE = 1, COARSE = 2.5;
@@ -141,17 +141,27 @@ static void derivatives(const struct pair *pair, int column, int row, double ret
 	ret[4] = (double)pair->other[at];
 }
 
-/* What is left of the difference beyond `cut` has no weight; what is left of each pixel goes to ret_left. */
-static int add_up(const struct pair *pair, const double unknowns[UNKNOWNS], double cut, struct normal *ret_normal,
-		  float *ret_left)
+/* Which of the STRIPS strips it is in. */
+static int strip_of(int at, int pixels)
 {
-	struct normal sums = {.weights = 0};
+	return (at - EDGE) * STRIPS / (pixels - 2 * EDGE);
+}
+
+/*
+ * What is left of the difference beyond `cut` has no weight; what is left of each pixel goes to ret_left. cells: of a
+ * strip of rows and one of columns.
+ */
+static int add_up(const struct pair *pair, const double unknowns[UNKNOWNS], double cut,
+		  struct normal cells[STRIPS][STRIPS], float *ret_left)
+{
 	int count = 0;
 
+	memset(cells, 0, STRIPS * STRIPS * sizeof(cells[0][0]));
 	for (int row = EDGE; row < pair->rows - EDGE; row++)
 		for (int column = EDGE; column < pair->columns - EDGE; column++) {
 			const size_t at = (size_t)row * (size_t)pair->columns + (size_t)column;
 			const double difference = (double)pair->image[at] - (double)pair->other[at];
+			struct normal *sums = &cells[strip_of(row, pair->rows)][strip_of(column, pair->columns)];
 			double d[UNKNOWNS], left = difference, share, weight;
 
 			derivatives(pair, column, row, d);
@@ -161,43 +171,93 @@ static int add_up(const struct pair *pair, const double unknowns[UNKNOWNS], doub
 			weight = share < 1 ? pow(1 - share * share, 2) : 0;
 			for (int i = 0; i < UNKNOWNS; i++) {
 				for (int j = 0; j <= i; j++)
-					sums.matrix[i][j] += weight * d[i] * d[j];
-				sums.right[i] += weight * d[i] * difference;
+					sums->matrix[i][j] += weight * d[i] * d[j];
+				sums->right[i] += weight * d[i] * difference;
 			}
-			sums.squares += weight * left * left;
-			sums.weights += weight;
+			sums->squares += weight * left * left;
+			sums->weights += weight;
 			ret_left[count++] = (float)fabs(left);
 		}
-	for (int i = 0; i < UNKNOWNS; i++)
-		for (int j = i + 1; j < UNKNOWNS; j++)
-			sums.matrix[i][j] = sums.matrix[j][i];
-	*ret_normal = sums;
 	return count;
+}
+
+/* Of all cells but those in strips from `from` to before `to`, of columns (axis 0) or of rows (1). */
+static struct normal normal_without(struct normal cells[STRIPS][STRIPS], int axis, int from, int to)
+{
+	struct normal sums = {.weights = 0};
+
+	for (int cell = 0; cell < STRIPS * STRIPS; cell++) {
+		const int row = cell / STRIPS, column = cell % STRIPS, strip = axis == 0 ? column : row;
+		const struct normal *of_cell = &cells[row][column];
+
+		if (strip >= from && strip < to)
+			continue;
+		for (int i = 0; i < UNKNOWNS; i++) {
+			for (int j = 0; j < UNKNOWNS; j++)
+				sums.matrix[i][j] += of_cell->matrix[i > j ? i : j][i > j ? j : i];
+			sums.right[i] += of_cell->right[i];
+		}
+		sums.squares += of_cell->squares;
+		sums.weights += of_cell->weights;
+	}
+	return sums;
+}
+
+/* Inverts the matrix; the unknowns are 0 where there is no solution. */
+static bool solve(struct normal *normal, double ret_unknowns[UNKNOWNS])
+{
+	memset(ret_unknowns, 0, UNKNOWNS * sizeof(ret_unknowns[0]));
+	if (!(normal->weights > 0) || !invert(normal->matrix))
+		return false;
+	for (int i = 0; i < UNKNOWNS; i++)
+		for (int j = 0; j < UNKNOWNS; j++)
+			ret_unknowns[i] += normal->matrix[i][j] * normal->right[j];
+	return true;
+}
+
+/* The jackknife: what the shift would be without each strip, and without each half, in turn. */
+static void doubt_by_parts(struct normal cells[STRIPS][STRIPS], const double unknowns[UNKNOWNS],
+			   struct image_shift *shift)
+{
+	for (int axis = 0; axis < 2; axis++)
+		for (int parts = 2; parts <= STRIPS; parts += STRIPS - 2) {
+			double squares[2] = {0};
+
+			for (int part = 0; part < parts; part++) {
+				const int width = STRIPS / parts;
+				struct normal rest = normal_without(cells, axis, part * width, (part + 1) * width);
+				double without[UNKNOWNS];
+
+				solve(&rest, without);
+				for (int a = 0; a < 2; a++)
+					squares[a] += pow(without[a] - unknowns[a], 2);
+			}
+			for (int a = 0; a < 2; a++)
+				shift->doubt[a] = fmax(shift->doubt[a], sqrt(squares[a] * (parts - 1) / parts));
+		}
 }
 
 static bool fit(const struct pair *pair, struct image_shift *ret_shift)
 {
 	/* A smoothed pixel shares its noise with so many others. */
 	const double alike = fmax(1, 4 * acos(-1) * FINE * FINE);
-	double unknowns[UNKNOWNS] = {0}, cut = INFINITY, variance;
-	struct normal normal;
+	double unknowns[UNKNOWNS] = {0}, cut = INFINITY;
+	struct normal cells[STRIPS][STRIPS], normal;
 
 	for (int pass = 0; pass <= PASSES; pass++) {
-		const int count = add_up(pair, unknowns, cut, &normal, pair->work);
+		const int count = add_up(pair, unknowns, cut, cells, pair->work);
 
-		variance = normal.squares / normal.weights;
-		if (!(normal.weights > 0) || !invert(normal.matrix))
+		normal = normal_without(cells, 0, 0, 0);
+		if (!solve(&normal, unknowns))
 			return false;
-		memset(unknowns, 0, sizeof(unknowns));
-		for (int i = 0; i < UNKNOWNS; i++)
-			for (int j = 0; j < UNKNOWNS; j++)
-				unknowns[i] += normal.matrix[i][j] * normal.right[j];
 		cut = TUKEY * MAD * (double)select_kth(pair->work, count, count / 2) + 1e-12;
 	}
 	for (int a = 0; a < 2; a++) {
 		ret_shift->bins[a] = unknowns[a];
-		ret_shift->sigma[a] = sqrt(alike * variance * normal.matrix[a][a]);
+		ret_shift->sigma[a] = sqrt(alike * normal.squares / normal.weights * normal.matrix[a][a]);
+		ret_shift->doubt[a] = ret_shift->sigma[a];
 	}
+	doubt_by_parts(cells, unknowns, ret_shift);
 	return true;
 }
 

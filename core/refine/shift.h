@@ -7,6 +7,9 @@
 struct image_shift {
 	double bins[2];  /* along columns and rows */
 	double sigma[2]; /* standard deviations by what the fit leaves unexplained */
+	/* The same by how much the shift would be another one without a quarter or a half of the image, not below
+	 * sigma: what is in one part only is no shift of the image. */
+	double doubt[2];
 	/*
 	 * The share of the detail of `image`, beyond its noise, that `other` does not show where it lies; 0 where noise
 	 * is half of the detail. A shift of more than some bins shows here and not in `bins`.
