@@ -8,6 +8,7 @@
  * core/recon/recipe.h has its defaults, its ranges, and what is filled in.
  */
 enum { EMIT_FDK = 0, EMIT_FDK_TV = -1 }; /* beside iterations 1, 2, ... */
+enum { RECIPE_ID_SIZE = 64 };
 
 /* Backprojection of the iterations: plan_options.matched. */
 enum projector { PROJECTOR_INTERPOLATING, PROJECTOR_MATCHED, PROJECTOR_COUNT };
@@ -56,6 +57,8 @@ struct recipe {
 	bool hold_out; /* some views have no part in the volumes, which are held against them (core/recon/held_out.h) */
 	struct {
 		bool geometry, motion; /* one of them at most: how views are moved to fit (core/refine/refine.h) */
+		/* The job whose last volume is the reference, by its id; "": none. Needs one of them. */
+		char reference[RECIPE_ID_SIZE];
 	} refine;
 	bool keep_all; /* not asked for: all projections are kept, so that spoiled ones can be mended (recon_lacks) */
 	int binning;   /* pixels a side that are taken as one (core/correct/binning.h); BINNING_AUTO until resolved */

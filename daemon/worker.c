@@ -427,6 +427,8 @@ static int run_job(struct worker *worker, const struct message *start, int *ret_
 						 .scan = start->request.scan,
 						 .patient = &start->request.patient,
 						 .iteration = start->iteration,
+						 .reference = start->reference[0] != '\0' ? start->reference : NULL,
+						 .reference_grid = start->grid,
 						 .checkpoint_seconds = start->checkpoint_seconds,
 						 .hooks = &hooks};
 	unsigned char *present = NULL;

@@ -14,8 +14,8 @@ enum message_kind {
 	/* daemon -> worker */
 	/*
 	 * job, scan_directory, job_directory, recipe, iteration (0, or resume from the checkpoint), checkpoint_seconds,
-	 * cards, reduced and present, arriving: the projections come by MESSAGE_VIEWS; otherwise all that are present
-	 * are there
+	 * cards, reduced and present, reference and grid: a volume that the recipe's refinement goes by, arriving: the
+	 * projections come by MESSAGE_VIEWS; otherwise all that are present are there
 	 */
 	MESSAGE_START,
 	/*
@@ -63,6 +63,7 @@ struct message {
 	enum message_kind kind;
 	char job[64];
 	char scan_directory[1024], job_directory[1024];
+	char reference[1024];       /* path; "": none */
 	struct job_request request; /* START; recipe owned by the message: message_clear */
 	char cards[64];             /* numbers of the devices that work together, "0,2"; "": the worker's own alone */
 	bool arriving, reduced;

@@ -138,11 +138,45 @@ static int read_metal(struct recipe *recipe, const cJSON *value, struct error *e
 	return parameters_read(value, "/metal", &set, recipe, err);
 }
 
+static int read_reference(struct recipe *recipe, const cJSON *value, struct error *err)
+{
+	struct json_reader reader;
+
+	if (value == NULL || cJSON_IsNull(value))
+		return 0;
+	json_begin(&reader, value, "/refine/reference", err);
+	json_string(&reader, "job", true, recipe->refine.reference, sizeof(recipe->refine.reference));
+	return json_end(&reader);
+}
+
+/* Beside its parameters an object, whose member is a name. */
 static int read_refine(struct recipe *recipe, const cJSON *value, struct error *err)
 {
 	const struct parameter_set set = members_of("/refine");
+	const cJSON *reference = cJSON_GetObjectItemCaseSensitive(value, "reference");
+	cJSON *rest;
+	int code;
 
-	return parameters_read(value, "/refine", &set, recipe, err);
+	if (reference == NULL)
+		return parameters_read(value, "/refine", &set, recipe, err);
+	rest = cJSON_Duplicate(value, true);
+	if (rest == NULL)
+		return error_set(err, ERR_NO_MEMORY, "no memory for a recipe");
+	cJSON_DeleteItemFromObjectCaseSensitive(rest, "reference");
+	code = parameters_read(rest, "/refine", &set, recipe, err);
+	cJSON_Delete(rest);
+	return code == 0 ? read_reference(recipe, reference, err) : code;
+}
+
+/* A recipe without a reference has no such member. */
+static bool add_reference(cJSON *document, const struct recipe *recipe)
+{
+	cJSON *refine = cJSON_GetObjectItemCaseSensitive(document, "refine"), *reference;
+
+	if (recipe->refine.reference[0] == '\0')
+		return true;
+	reference = cJSON_AddObjectToObject(refine, "reference");
+	return reference != NULL && cJSON_AddStringToObject(reference, "job", recipe->refine.reference) != NULL;
 }
 
 static int read_emitted(struct json_reader *reader, const cJSON *element, int index, int *ret_emit)
@@ -405,7 +439,8 @@ static bool add_recipe(cJSON *document, const struct recipe *recipe)
 				  recipe);
 	return added && add_stage(document, "tv", "/tv", recipe->tv.on, recipe) &&
 	       add_stage(document, "metal", "/metal", recipe->metal.on, recipe) &&
-	       add_stage(document, "refine", "/refine", true, recipe) && parameters_add(document, &set, recipe);
+	       add_stage(document, "refine", "/refine", true, recipe) && add_reference(document, recipe) &&
+	       parameters_add(document, &set, recipe);
 }
 
 cJSON *recipe_json(const struct recipe *recipe)

@@ -29,6 +29,7 @@ struct job_request {
 	struct patient patient; /* of the scan, once resolved, unless the job says otherwise */
 	struct recipe recipe;   /* owned */
 };
+#define REFERENCE_VOLUME "final" /* of the job that is a reference */
 /* "where", with as many devices as the job has. */
 struct where job_request_where(const struct job_request *request);
 void job_request_clear(struct job_request *request);

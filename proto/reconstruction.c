@@ -28,6 +28,7 @@
 #include "proto/durable.h"
 #include "proto/format.h"
 #include "proto/nifti.h"
+#include "proto/reference.h"
 #include "proto/refinement.h"
 #include "proto/saver.h"
 #include "proto/seal.h"
@@ -557,8 +558,10 @@ static int open_recon(struct reconstruction *reconstruction, struct error *err)
 	struct recipe recipe = *reconstruction->options->recipe;
 	int code;
 
-	if (reconstruction->refined)
+	if (reconstruction->refined) {
 		recipe.refine.geometry = recipe.refine.motion = false;
+		recipe.refine.reference[0] = '\0';
+	}
 	recipe.keep_all = reconstruction->keeps_all;
 	code = recon_open(reconstruction->backend, reconstruction->device, geometry, &reconstruction->linearise,
 			  &recipe, &reconstruction->hooks, &reconstruction->recon, err);
@@ -856,19 +859,42 @@ static int tell_refinement(struct reconstruction *reconstruction, const struct r
 	return code;
 }
 
+/* No voxels where the recipe names none. */
+static int read_reference(struct reconstruction *reconstruction, struct refine_reference *ret_reference,
+			  struct error *err)
+{
+	const struct reconstruction_options *options = reconstruction->options;
+	int code;
+
+	if (options->recipe->refine.reference[0] == '\0')
+		return 0;
+	if (options->reference == NULL)
+		return error_set_at(err, ERR_IMPOSSIBLE, "/refine/reference",
+				    "a reference is a job of a daemon's: here there is none");
+	disk_steps(&reconstruction->run, true);
+	code = reference_read(options->reference, &options->reference_grid, ret_reference, err);
+	disk_steps(&reconstruction->run, false);
+	return code;
+}
+
 /*
  * Called once all projections have been pushed. Where another geometry fits them better the reconstruction is opened
  * anew with it, *ret_again, and has none of them; a resumed one, too, to go on from its checkpoint.
  */
 static int heed_poses(struct reconstruction *reconstruction, bool *ret_again, struct error *err)
 {
+	struct refine_reference reference = {.voxels = NULL};
 	struct refinement refinement;
 	int code;
 
 	*ret_again = false;
 	if (!looks_for_poses(reconstruction))
 		return 0;
-	code = recon_refine(reconstruction->recon, &refinement, &reconstruction->poses, err);
+	code = read_reference(reconstruction, &reference, err);
+	if (code == 0)
+		code = recon_refine(reconstruction->recon, reference.voxels != NULL ? &reference : NULL, &refinement,
+				    &reconstruction->poses, err);
+	free((void *)(uintptr_t)reference.voxels);
 	if (code < 0)
 		return code;
 	reconstruction->refined = true;

@@ -49,6 +49,10 @@ struct reconstruction_options {
 	/* A flag for each projection of scan.json: those that make up the scan, the others never come. NULL: all. */
 	const unsigned char *present;
 	const struct recipe *recipe;
+	/* A volume with checksums that a recipe with a reference goes by, and its grid. NULL: such a recipe is refused.
+	 */
+	const char *reference;
+	struct grid reference_grid;
 	/* For the files' descriptions: the program, job and scan by their names ("" or NULL: none). */
 	const char *program, *job, *scan;
 	const struct patient *patient; /* NULL: as scan.json says */

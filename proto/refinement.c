@@ -67,6 +67,10 @@ cJSON *refined_json(const struct refined *refined)
 	cJSON_AddStringToObject(json, "kind", refined->kind == REFINE_MOTION ? "motion" : "geometry");
 	cJSON_AddBoolToObject(json, "accepted", refinement->accepted);
 	add_held_out(json, refinement);
+	if (refinement->alike > 0)
+		cJSON_AddNumberToObject(json, "reference", refinement->alike);
+	else
+		cJSON_AddNullToObject(json, "reference");
 	cJSON_AddNumberToObject(json, "rms_mm", refined->rms[0]);
 	cJSON_AddNumberToObject(json, "rms_deg", refined->rms[1]);
 	cJSON_AddNumberToObject(json, "most_mm", refined->most[0]);
@@ -92,6 +96,14 @@ const char *refined_tell(const struct refined *refined, char *ret_detail, size_t
 	const struct refinement *refinement = refined->refinement;
 	const bool motion = refined->kind == REFINE_MOTION;
 
+	if (!refinement->accepted && refinement->alike > 0) {
+		snprintf(
+		    ret_detail, size,
+		    "the reference's detail stands in %d views that were held out by a factor of %.2f (1: the same "
+		    "object); %d of them agree better with other poses",
+		    refinement->held_out, refinement->alike, refinement->better);
+		return "not_refined";
+	}
 	if (!refinement->accepted) {
 		snprintf(ret_detail, size,
 			 refinement->held_out > 0 ? "%d views that were held out do not agree better with any other"

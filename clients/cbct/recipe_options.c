@@ -149,7 +149,7 @@ static void add_option(const struct parameter *parameter, const struct algorithm
 	struct option *row = &recipe_option_rows[entry_count];
 	const bool flag = (entry->special = special_of(parameter)) != NULL && entry->special->flag != NULL;
 
-	assert(entry_count < RECIPE_OPTIONS_MAX - 3);
+	assert(entry_count < RECIPE_OPTIONS_MAX - 4);
 	entry->parameter = parameter;
 	entry->algorithm = algorithm;
 	name_option(entry);
@@ -197,6 +197,17 @@ void recipe_options_make(void)
 			    0,           NULL};
 	recipe_option_rows[entry_count + 2] = (struct option){
 	    "preset", 0, OPTION_TEXT, offsetof(struct recipe_options, preset), "NAME", preset_help(), 0, 0, 0, NULL};
+	recipe_option_rows[entry_count + 3] =
+	    (struct option){"refine-reference",
+			    0,
+			    OPTION_TEXT,
+			    offsetof(struct recipe_options, reference),
+			    "JOB",
+			    "refine with the last volume of that job of the same object",
+			    0,
+			    0,
+			    0,
+			    NULL};
 }
 
 /* ---- documents from options ---- */
@@ -418,6 +429,8 @@ int recipe_document(const struct recipe_options *options, const char *path, cons
 	if (options->no_fdk)
 		put(document, "fdk", cJSON_CreateNull());
 	code = put_options(options, document, err);
+	if (options->reference != NULL)
+		put(stage(stage(document, "refine"), "reference"), "job", cJSON_CreateString(options->reference));
 	/* Options that name a stage are beside the FDK; a document without any stage has all of them. */
 	if (options->preset != NULL)
 		put(document, "preset", cJSON_CreateString(options->preset));

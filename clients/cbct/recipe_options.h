@@ -16,6 +16,7 @@ struct recipe_options {
 	bool no_fdk;
 	const char *emit;
 	const char *preset; /* proto/preset.h */
+	const char *reference;
 };
 extern struct option recipe_option_rows[];
 void recipe_options_make(void); /* fills the rows; once, before any command line is parsed */

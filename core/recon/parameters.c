@@ -170,5 +170,7 @@ bool recipe_same(const struct recipe *a, const struct recipe *b)
 	for (int i = 0; i < recipe_parameter_count; i++)
 		if (!parameter_same(&recipe_parameters[i], a, b))
 			return false;
+	if (strcmp(a->refine.reference, b->refine.reference) != 0)
+		return false;
 	return a->emits == 0 || memcmp(a->emit, b->emit, (size_t)a->emits * sizeof(*a->emit)) == 0;
 }

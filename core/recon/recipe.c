@@ -197,6 +197,9 @@ int recipe_check(const struct recipe *recipe, const struct geometry *geometry, s
 	if (code == 0 && recipe->refine.geometry && recipe->refine.motion)
 		code = error_set_at(err, ERR_IMPOSSIBLE, "/refine",
 				    "\"geometry\" beside \"motion\": a scan does not tell one from the other");
+	if (code == 0 && recipe->refine.reference[0] != '\0' && !recipe->refine.geometry && !recipe->refine.motion)
+		code = error_set_at(err, ERR_IMPOSSIBLE, "/refine/reference",
+				    "a reference is for \"geometry\" or \"motion\", and neither is asked for");
 	if (code == 0)
 		code = check_emit(recipe, err);
 	if (code == 0 && recipe->has_grid)

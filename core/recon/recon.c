@@ -352,8 +352,8 @@ static void tell_refining(void *context, double share)
 	recon_tell_progress(recon, recon_runs_fdk(recon) ? STAGE_FDK : STAGE_LOAD, recon->iteration);
 }
 
-int recon_refine(struct recon *recon, struct refinement *ret_refinement, struct geometry *ret_geometry,
-		 struct error *err)
+int recon_refine(struct recon *recon, const struct refine_reference *reference, struct refinement *ret_refinement,
+		 struct geometry *ret_geometry, struct error *err)
 {
 	const struct refine_watch watch = {&recon->cancel, tell_refining, recon};
 	const struct input *input = &recon->input;
@@ -366,7 +366,7 @@ int recon_refine(struct recon *recon, struct refinement *ret_refinement, struct 
 	recon->refine_from = recon->work_done;
 	if (recon->refining != NULL)
 		code = refining_find(recon->refining, &recon->recipe, &recon->orbit, input->blank, input->counts.blank,
-				     &watch, &refinement, err);
+				     reference, &watch, &refinement, err);
 	recon->work_done = recon->refine_from + recon->refine_work;
 	if (code == 0 && refinement.accepted)
 		code = move_views(recon, &refinement, ret_geometry, err);

@@ -124,11 +124,11 @@ int recon_push(struct recon *recon, const void *samples, const int *views, int c
 /*
  * After the last view, where the recipe asks to refine the geometry: fits it (core/refine/refine.h). What is accepted
  * makes *ret_geometry, which a reconstruction opened anew goes by; free with geometry_clear. Where nothing was tried or
- * accepted it stays untouched, and this reconstruction goes on. The same views give the same bits, so that a resumed
- * run gets the geometry that its checkpoint was made with.
+ * accepted it stays untouched, and this reconstruction goes on. reference: where the recipe names one, else NULL. The
+ * same views give the same bits, so that a resumed run gets the geometry that its checkpoint was made with.
  */
-int recon_refine(struct recon *recon, struct refinement *ret_refinement, struct geometry *ret_geometry,
-		 struct error *err);
+int recon_refine(struct recon *recon, const struct refine_reference *reference, struct refinement *ret_refinement,
+		 struct geometry *ret_geometry, struct error *err);
 /* The motion that it has found for a view: as path_motion. */
 void recon_motion(const struct recon *recon, const struct refinement *refinement, int view,
 		  double ret_motion[PATH_NUMBERS]);

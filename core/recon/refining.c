@@ -5,13 +5,15 @@
 
 struct refining {
 	enum refine_kind kind;
+	bool is_referred;
 	struct reduced reduced;
 	float *view; /* [row][column], on its way into bins */
 };
 
 static bool is_wanted(const struct recipe *recipe, const struct geometry *geometry, const struct orbit *orbit)
 {
-	return (recipe->refine.geometry || recipe->refine.motion) && refine_is_possible(geometry, orbit);
+	return (recipe->refine.geometry || recipe->refine.motion) &&
+	       refine_is_possible(geometry, orbit, recipe->refine.reference[0] != '\0');
 }
 
 int refining_new(const struct recipe *recipe, const struct geometry *geometry, const struct orbit *orbit,
@@ -25,6 +27,7 @@ int refining_new(const struct recipe *recipe, const struct geometry *geometry, c
 	refining = calloc(1, sizeof(*refining));
 	if (refining == NULL)
 		return error_set(err, ERR_NO_MEMORY, "no memory to refine a geometry");
+	refining->is_referred = recipe->refine.reference[0] != '\0';
 	refining->kind = recipe->refine.motion ? REFINE_MOTION : REFINE_GEOMETRY;
 	code = reduced_open(&refining->reduced, geometry, orbit, REFINE_VIEWS_MOST, REFINE_BINS_MOST, err);
 	refining->view = malloc((size_t)geometry->columns * (size_t)geometry->rows * sizeof(float));
@@ -59,6 +62,8 @@ int refining_bytes(const struct recipe *recipe, const struct geometry *geometry,
 	if (code < 0)
 		return code;
 	code = refine_bytes(&reduced, &working, err);
+	if (recipe->refine.reference[0] != '\0')
+		working += REFERENCE_BYTES;
 	*bytes += working + reduced_bytes(geometry, REFINE_VIEWS_MOST, REFINE_BINS_MOST) +
 		  (size_t)geometry->columns * (size_t)geometry->rows * sizeof(float);
 	reduced_clear(&reduced);
@@ -79,18 +84,22 @@ int refining_take(struct refining *refining, const struct backend *backend, stru
 }
 
 int refining_find(struct refining *refining, const struct recipe *recipe, const struct orbit *orbit, const int *blank,
-		  int blanks, const struct refine_watch *watch, struct refinement *ret_refinement, struct error *err)
+		  int blanks, const struct refine_reference *reference, const struct refine_watch *watch,
+		  struct refinement *ret_refinement, struct error *err)
 {
 	for (int i = 0; i < blanks; i++)
 		reduced_leave_out(&refining->reduced, blank[i]);
-	return refine_find(&refining->reduced, orbit, refining->kind, recipe->mu_water, watch, ret_refinement, err);
+	return refine_find(&refining->reduced, orbit, refining->kind, recipe->mu_water, reference, watch,
+			   ret_refinement, err);
 }
 
 int refining_work(const struct refining *refining, const struct grid *grid, int views, double *ret_work,
 		  struct error *err)
 {
 	double updates = 0;
-	int code = refining == NULL ? 0 : refine_work(&refining->reduced, refining->kind, &updates, err);
+	int code = refining == NULL
+		       ? 0
+		       : refine_work(&refining->reduced, refining->kind, refining->is_referred, &updates, err);
 
 	if (code == 0)
 		*ret_work = updates / ((double)grid_voxels(grid) * views);

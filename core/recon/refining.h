@@ -19,7 +19,8 @@ int refining_take(struct refining *refining, const struct backend *backend, stru
 		  struct error *err);
 /* Leaves views out that show nothing, and finds the motions. */
 int refining_find(struct refining *refining, const struct recipe *recipe, const struct orbit *orbit, const int *blank,
-		  int blanks, const struct refine_watch *watch, struct refinement *ret_refinement, struct error *err);
+		  int blanks, const struct refine_reference *reference, const struct refine_watch *watch,
+		  struct refinement *ret_refinement, struct error *err);
 /* What that takes, in FDKs of the whole scan, roughly; 0 for NULL. It is the processor that finds them. */
 int refining_work(const struct refining *refining, const struct grid *grid, int views, double *ret_work,
 		  struct error *err);

@@ -25,7 +25,8 @@ static const struct schedule {
 	[REFINE_GEOMETRY] = {{4, 5, 1, 400}, {2, 5, 0, 400}},
 	[REFINE_MOTION] = {{4, 5, 2, 100}, {2, 5, 0, 100}},
 },
-  alone = {4, 5, 2, 100}; /* of a scan that has few bins */
+  alone = {4, 5, 2, 100}, /* of a scan that has few bins */
+    referred[LEVELS] = {{0, 4, 1, 100}, {0, 4, 0, 100}};
 /*
  * What a path must reach to be kept: the share by which held-out views are explained better, the share of these views
  * that are, and the path's size in bins. Of 17 paths that were found where nothing is to be found one passed the first,
@@ -33,19 +34,26 @@ static const struct schedule {
  */
 static const double BETTER[REFINE_KINDS] = {[REFINE_GEOMETRY] = .003, [REFINE_MOTION] = .02};
 static const double BETTER_VIEWS = 0.65, SIZE_LEAST = 0.055;
+/*
+ * And how much alike a reference's detail must be: a volume of another object leaves the views explained better in some
+ * place, too.
+ */
+static const double ALIKE_LEAST = 0.7;
 
 struct run {
 	const struct refine_watch *watch;
 	double work_all, work_done, unit; /* updates of a voxel by a view; unit: of one FDK of the level */
 	double *squares[2]; /* [views], of held-out ones: what is unexplained without motion, and with it */
-	struct grid grid;   /* of the coarser level's volumes, */
-	float *volumes[2];  /* without motion and with it; NULL on the first level */
+	const struct refine_reference *reference;
+	struct grid grid;  /* of the coarser level's volumes, */
+	float *volumes[2]; /* without motion and with it; NULL on the first level */
 };
 
-bool refine_is_possible(const struct geometry *geometry, const struct orbit *orbit)
+bool refine_is_possible(const struct geometry *geometry, const struct orbit *orbit, bool is_referred)
 {
-	return geometry->count >= VIEWS_LEAST && geometry->columns >= BINS_LEAST && geometry->rows >= BINS_LEAST &&
-	       orbit->arc >= ARC_LEAST && orbit->field_of_view > 0;
+	return geometry->count >= (is_referred ? VIEWS_LEAST / 2 : VIEWS_LEAST) && geometry->columns >= BINS_LEAST &&
+	       geometry->rows >= BINS_LEAST && orbit->arc >= (is_referred ? ARC_LEAST / 2 : ARC_LEAST) &&
+	       orbit->field_of_view > 0;
 }
 
 double refine_place(const struct orbit *orbit, int view)
@@ -87,13 +95,16 @@ static int levels_of(const struct reduced *reduced)
 		   : 1;
 }
 
-static const struct schedule *schedule_of(const struct reduced *reduced, int level, enum refine_kind kind)
+static const struct schedule *schedule_of(const struct reduced *reduced, int level, enum refine_kind kind,
+					  bool is_referred)
 {
+	if (is_referred)
+		return &referred[level];
 	return levels_of(reduced) == 1 ? &alone : &schedules[kind][level];
 }
 
 static struct registration_options options_of(const struct reduced *reduced, const struct reduced *half, int level,
-					      enum refine_kind kind)
+					      enum refine_kind kind, bool is_referred)
 {
 	const struct geometry *geometry = &reduced->geometry;
 	const bool is_coarse = level + 1 < levels_of(reduced);
@@ -102,16 +113,17 @@ static struct registration_options options_of(const struct reduced *reduced, con
 	return (struct registration_options){.reduced = is_coarse ? half : reduced,
 					     .kind = kind,
 					     .mu_water = 1,
-					     .alike = schedule_of(reduced, level, kind)->alike,
+					     .alike = schedule_of(reduced, level, kind, is_referred)->alike,
+					     .referred = is_referred,
 					     .bins = is_fine && !is_coarse ? REFINE_BINS_MOST : BINS_COARSE};
 }
 
 /* FDKs of a level. */
-static int work_of(const struct schedule *schedule)
+static int work_of(const struct schedule *schedule, bool is_referred)
 {
 	const int steps = schedule->steps * (1 + schedule->doublings);
 
-	return 2 * (schedule->warm + steps) * ITERATION_WORK + steps * STEP_WORK;
+	return (is_referred ? 0 : 2 * (schedule->warm + steps) * ITERATION_WORK) + steps * STEP_WORK;
 }
 
 int refine_bytes(const struct reduced *reduced, size_t *ret_bytes, struct error *err)
@@ -121,7 +133,7 @@ int refine_bytes(const struct reduced *reduced, size_t *ret_bytes, struct error 
 	int code = reduced_halve(reduced, &half, err);
 
 	for (int level = 0; level < levels_of(reduced) && code == 0; level++) {
-		struct registration_options options = options_of(reduced, &half, level, REFINE_GEOMETRY);
+		struct registration_options options = options_of(reduced, &half, level, REFINE_GEOMETRY, false);
 		size_t more = 0;
 
 		options.empty = options.wide = true;
@@ -135,32 +147,33 @@ int refine_bytes(const struct reduced *reduced, size_t *ret_bytes, struct error 
 }
 
 /* Of all levels; empty: the views have not come yet. */
-static int count_updates(const struct reduced *reduced, const struct reduced *half, enum refine_kind kind, bool empty,
-			 double *ret_updates, struct error *err)
+static int count_updates(const struct reduced *reduced, const struct reduced *half, enum refine_kind kind,
+			 bool is_referred, bool empty, double *ret_updates, struct error *err)
 {
 	double updates = 0;
 	int code = 0;
 
 	for (int level = 0; level < levels_of(reduced) && code == 0; level++) {
-		struct registration_options options = options_of(reduced, half, level, kind);
+		struct registration_options options = options_of(reduced, half, level, kind, is_referred);
 		double one = 0;
 
 		options.empty = empty;
 		code = registration_updates(&options, &one, err);
-		updates += work_of(schedule_of(reduced, level, kind)) * one;
+		updates += work_of(schedule_of(reduced, level, kind, is_referred), is_referred) * one;
 	}
 	if (code == 0)
 		*ret_updates = updates;
 	return code;
 }
 
-int refine_work(const struct reduced *reduced, enum refine_kind kind, double *ret_updates, struct error *err)
+int refine_work(const struct reduced *reduced, enum refine_kind kind, bool is_referred, double *ret_updates,
+		struct error *err)
 {
 	struct reduced half = {0};
 	int code = reduced_halve(reduced, &half, err);
 
 	if (code == 0)
-		code = count_updates(reduced, &half, kind, true, ret_updates, err);
+		code = count_updates(reduced, &half, kind, is_referred, true, ret_updates, err);
 	reduced_clear(&half);
 	return code;
 }
@@ -222,11 +235,66 @@ static int run_moved(struct run *run, struct registration *fit, const struct sch
 	return code == 0 ? registration_measure(fit, run->squares[1], ret_sum, err) : code;
 }
 
+/* The same steps with a reference, which is there from the beginning. */
+static int run_referred(struct run *run, struct registration *fit, const struct schedule *schedule,
+			struct refinement *refinement, double ret_sums[2], struct error *err)
+{
+	struct path *path = &refinement->path;
+	int code = registration_place(fit, NULL, err);
+
+	if (code == 0)
+		code = registration_refer(fit, run->reference, err);
+	if (code == 0)
+		code = registration_measure(fit, run->squares[0], &ret_sums[0], err);
+	if (code == 0)
+		code = registration_place(fit, path, err);
+	for (int doubled = 0; doubled <= schedule->doublings && code == 0; doubled++) {
+		if (doubled > 0)
+			path_double(path);
+		for (int i = 0; i < schedule->steps && code == 0; i++) {
+			code = registration_step(fit, path, err);
+			tell_work(run, STEP_WORK);
+			if (code == 0)
+				code = registration_place(fit, path, err);
+		}
+	}
+	if (code == 0)
+		code = registration_measure(fit, run->squares[1], &ret_sums[1], err);
+	return code == 0 ? registration_alike(fit, &refinement->alike, err) : code;
+}
+
 static int keep_volume(struct run *run, struct registration *fit, int which, struct error *err)
 {
 	free(run->volumes[which]);
 	run->volumes[which] = registration_keep_volume(fit, err);
 	return run->volumes[which] == NULL ? err->code : 0;
+}
+
+/* From the volumes of the level before, and for the next one. */
+static int run_alone(struct run *run, struct registration *fit, const struct schedule *schedule, bool last,
+		     struct refinement *refinement, double ret_sums[2], struct error *err)
+{
+	int code = run_still(run, fit, schedule, &ret_sums[0], err);
+
+	if (code == 0 && !last)
+		code = keep_volume(run, fit, 0, err);
+	if (code == 0)
+		code = run_moved(run, fit, schedule, &refinement->path, &ret_sums[1], err);
+	if (code == 0 && !last)
+		code = keep_volume(run, fit, 1, err);
+	run->grid = fit->grid;
+	return code;
+}
+
+/* What all views share is a motion where the reference says where the object lies. */
+static double size_of(const struct registration *fit, const struct refinement *refinement)
+{
+	const double size = path_size(&refinement->path);
+	double squares = size * size;
+
+	for (int i = 0; i < PATH_NUMBERS && fit->referred; i++)
+		squares += refinement->path.common[i] * refinement->path.common[i];
+	return sqrt(squares);
 }
 
 /* Whether what a path explains better of the held-out views is worth it. bin: mm at the isocentre. */
@@ -243,7 +311,8 @@ static void judge(const struct registration *fit, double *const squares[2], cons
 		refinement->better += squares[1][i] < squares[0][i];
 	refinement->accepted = refinement->held_after < refinement->held_before * (1 - BETTER[fit->kind]) &&
 			       refinement->better >= BETTER_VIEWS * fit->held_count &&
-			       path_size(&refinement->path) > SIZE_LEAST * bin;
+			       size_of(fit, refinement) > SIZE_LEAST * bin &&
+			       (!fit->referred || refinement->alike > ALIKE_LEAST);
 }
 
 static int run_level(struct run *run, const struct registration_options *options, const struct schedule *schedule,
@@ -256,16 +325,10 @@ static int run_level(struct run *run, const struct registration_options *options
 	if (code < 0)
 		return code;
 	run->unit = (double)grid_voxels(&fit.grid) * fit.geometry.count;
-	if (fit.held_count == 0 || fit.used_count < VIEWS_LEAST / 2)
+	if (fit.held_count == 0 || fit.used_count < (fit.referred ? VIEWS_LEAST / 3 : VIEWS_LEAST / 2))
 		goto out;
-	code = run_still(run, &fit, schedule, &sums[0], err);
-	if (code == 0 && !last)
-		code = keep_volume(run, &fit, 0, err);
-	if (code == 0)
-		code = run_moved(run, &fit, schedule, &refinement->path, &sums[1], err);
-	if (code == 0 && !last)
-		code = keep_volume(run, &fit, 1, err);
-	run->grid = fit.grid;
+	code = fit.referred ? run_referred(run, &fit, schedule, refinement, sums, err)
+			    : run_alone(run, &fit, schedule, last, refinement, sums, err);
 	if (code == 0 && last)
 		judge(&fit, run->squares, sums, sqrt(fit.orbit.pixel_at_isocentre[0] * fit.orbit.pixel_at_isocentre[1]),
 		      refinement);
@@ -277,13 +340,13 @@ out:
 /* ---- the whole ---- */
 
 static int open_run(struct run *run, const struct reduced *reduced, struct reduced *half, enum refine_kind kind,
-		    const struct refine_watch *watch, struct error *err)
+		    const struct refine_reference *reference, const struct refine_watch *watch, struct error *err)
 {
 	int code = reduced_halve(reduced, half, err);
 
-	*run = (struct run){.watch = watch};
+	*run = (struct run){.watch = watch, .reference = reference};
 	if (code == 0)
-		code = count_updates(reduced, half, kind, false, &run->work_all, err);
+		code = count_updates(reduced, half, kind, reference != NULL, false, &run->work_all, err);
 	for (int i = 0; i < 2 && code == 0; i++) {
 		run->squares[i] = malloc((size_t)reduced->geometry.count * sizeof(double));
 		if (run->squares[i] == NULL)
@@ -315,22 +378,23 @@ static struct path open_path(const struct orbit *orbit, enum refine_kind kind)
 }
 
 int refine_find(const struct reduced *reduced, const struct orbit *orbit, enum refine_kind kind, double mu_water,
-		const struct refine_watch *watch, struct refinement *ret_refinement, struct error *err)
+		const struct refine_reference *reference, const struct refine_watch *watch,
+		struct refinement *ret_refinement, struct error *err)
 {
 	struct refinement refinement = {.path = open_path(orbit, kind)};
 	const int levels = levels_of(reduced);
 	struct reduced half = {0};
 	struct run run;
-	int code = open_run(&run, reduced, &half, kind, watch, err);
+	int code = open_run(&run, reduced, &half, kind, reference, watch, err);
 
 	for (int level = 0; level < levels && code == 0; level++) {
-		struct registration_options options = options_of(reduced, &half, level, kind);
+		struct registration_options options = options_of(reduced, &half, level, kind, reference != NULL);
 
 		options.orbit = orbit;
 		options.mu_water = mu_water;
 		options.watch = watch;
-		code =
-		    run_level(&run, &options, schedule_of(reduced, level, kind), level + 1 == levels, &refinement, err);
+		code = run_level(&run, &options, schedule_of(reduced, level, kind, reference != NULL),
+				 level + 1 == levels, &refinement, err);
 	}
 	if (!refinement.accepted)
 		refinement.path = open_path(orbit, kind);

@@ -23,8 +23,12 @@
  * where the path is larger than most that are found where there is nothing to find (one of 17 such scans keeps one, of
  * .06 mm, and is the better for it).
  *
- * What all views share is no motion. Nor does a scan tell how large the object is: the way along the beam is expected
- * to be small. Bins limit what can be found, to about a thirtieth of one.
+ * A volume of the same object in the same world, of an earlier scan, can be the reference: then no volume is made, the
+ * views are registered with it as it is, and what they share is found, too. A reference whose detail the views that are
+ * held out do not show is of another object, and is not followed.
+ *
+ * Without a reference what all views share is no motion. Nor does a scan tell how large the object is: the way along
+ * the beam is expected to be small. Bins limit what can be found, to about a thirtieth of one.
  */
 enum { REFINE_VIEWS_MOST = 120, REFINE_BINS_MOST = 160 };
 
@@ -35,17 +39,26 @@ enum refine_kind {
 	REFINE_KINDS
 };
 
+/* What the views are registered with in place of a volume of their own: a volume in voxels of a bin or so is enough. */
+enum { REFERENCE_VOXELS_MOST = 256 /* a side */ };
+#define REFERENCE_BYTES ((size_t)REFERENCE_VOXELS_MOST * REFERENCE_VOXELS_MOST * REFERENCE_VOXELS_MOST * sizeof(float))
+struct refine_reference {
+	struct grid grid;    /* 2 to REFERENCE_VOXELS_MOST voxels along each axis */
+	const float *voxels; /* [z][y][x], 1/mm; borrowed */
+};
+
 struct refinement {
 	struct path path; /* no motion where it is not accepted */
 	bool accepted;
 	int held_out; /* views, */
 	/* and the root mean square of their detail that is unexplained, without and with the path, kept or not */
 	double held_before, held_after;
-	int better; /* views among them that are explained better */
+	int better;   /* views among them that are explained better */
+	double alike; /* of a reference's projections the share that the views' detail has, 1: the same; else 0 */
 };
 
-/* True if a scan has views, rows and columns enough. */
-bool refine_is_possible(const struct geometry *geometry, const struct orbit *orbit);
+/* True if a scan has views, rows and columns enough; with a reference (`is_referred`) half of the views are. */
+bool refine_is_possible(const struct geometry *geometry, const struct orbit *orbit, bool is_referred);
 /* Where a view stands on the path, radians from the first of the sweep on. */
 double refine_place(const struct orbit *orbit, int view);
 /*
@@ -58,7 +71,8 @@ void refine_change(enum refine_kind kind, const struct view *view, const double 
 /* Bytes of the host's memory that refine_find takes: it works on the CPU's backend. */
 int refine_bytes(const struct reduced *reduced, size_t *ret_bytes, struct error *err);
 /* What it takes, in updates of a voxel by a view as FDK makes them. */
-int refine_work(const struct reduced *reduced, enum refine_kind kind, double *ret_updates, struct error *err);
+int refine_work(const struct reduced *reduced, enum refine_kind kind, bool is_referred, double *ret_updates,
+		struct error *err);
 
 /* Who watches it. */
 struct refine_watch {
@@ -66,8 +80,9 @@ struct refine_watch {
 	void (*progress)(void *context, double share); /* behind each step: the share of all of them that is done */
 	void *context;
 };
-/* orbit: of the scan. mu_water in 1/mm. The same bits for any number of threads. */
+/* orbit: of the scan. mu_water in 1/mm. reference: NULL for none. The same bits for any number of threads. */
 int refine_find(const struct reduced *reduced, const struct orbit *orbit, enum refine_kind kind, double mu_water,
-		const struct refine_watch *watch, struct refinement *ret_refinement, struct error *err);
+		const struct refine_reference *reference, const struct refine_watch *watch,
+		struct refinement *ret_refinement, struct error *err);
 
 #endif

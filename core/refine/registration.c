@@ -15,6 +15,7 @@
 enum { HELD_OUT = 8, SUBSETS = 10, EDGE = 4, IMAGES = REGISTRATION_IMAGES, TV_STEPS = 30 };
 static const double FINE = 1, COARSE = 4, COARSE_CUT = 2.5; /* bins; COARSE_CUT of a body wider than the detector */
 static const double FACTOR = 1.5;                           /* of a step: the volume follows each */
+static const double FACTOR_REFERRED = 1;                    /* a reference does not */
 static const double TV_ALPHA = 0.05;
 static const double MAD = 1.4826;
 /* What a body that goes on outside of the grid makes of `alike`. */
@@ -24,6 +25,12 @@ static const double WIDE = 1.6, CUT_SHARE = 0.1;
 static const double EXPECTED[REFINE_KINDS][PATH_NUMBERS] = {
     [REFINE_GEOMETRY] = {1, 1, .05, .1, .1, 2},
     [REFINE_MOTION] = {2, 2, 1, 4, 4, 5},
+};
+
+/* A reference tells a tilt from a turn of the object, so that both may be larger. */
+static const double EXPECTED_REFERRED[REFINE_KINDS][PATH_NUMBERS] = {
+    [REFINE_GEOMETRY] = {2, 2, .5, 1, 1, 2},
+    [REFINE_MOTION] = {2, 2, 2, 4, 4, 5},
 };
 
 static int host_threads(void)
@@ -94,6 +101,7 @@ static int describe(struct registration *fit, const struct registration_options 
 				     .kind = options->kind,
 				     .watch = options->watch,
 				     .alike = options->alike,
+				     .referred = options->referred,
 				     .cut = options->empty ? options->wide : is_cut(reduced)};
 	code = geometry_copy(&fit->geometry, &reduced->geometry, err);
 	if (code == 0)
@@ -415,7 +423,9 @@ int registration_step(struct registration *fit, struct path *path, struct error 
 		add_up_view(fit, fit->used[i]);
 		pulse_beat();
 	}
-	return path_step(path, fit->views, fit->geometry.count, EXPECTED[fit->kind], FACTOR, err);
+	return path_step(path, fit->views, fit->geometry.count,
+			 fit->referred ? EXPECTED_REFERRED[fit->kind] : EXPECTED[fit->kind],
+			 fit->referred ? FACTOR_REFERRED : FACTOR, err);
 }
 
 /* Squares of the detail of each held-out view that the volume does not explain, and their sum. */
@@ -435,6 +445,31 @@ int registration_measure(struct registration *fit, double *ret_squares, double *
 				ret_squares[i] += pow((double)image[row * columns + column], 2);
 		*ret_sum += ret_squares[i];
 	}
+	return code;
+}
+
+int registration_alike(struct registration *fit, double *ret_alike, struct error *err)
+{
+	const int columns = fit->geometry.columns, rows = fit->geometry.rows;
+	const size_t pixels = pixels_of(fit), apart = (size_t)fit->geometry.count * pixels;
+	double products = 0, squares = 0;
+	int code = project(fit, fit->volume, fit->held, fit->held_count, 1, err);
+
+	for (int i = 0; i < fit->held_count && code == 0; i++) {
+		const float *residual = fit->images + (size_t)fit->held[i] * pixels;
+		float *made = fit->images + apart + (size_t)fit->held[i] * pixels;
+
+		keep_detail(fit, made, fit->scratch);
+		for (int row = EDGE; row < rows - EDGE; row++)
+			for (int column = EDGE; column < columns - EDGE; column++) {
+				const double value = (double)made[row * columns + column];
+
+				products += value * (double)residual[row * columns + column];
+				squares += value * value;
+			}
+	}
+	if (code == 0)
+		*ret_alike = squares > 0 ? 1 + products / squares : 0;
 	return code;
 }
 
@@ -500,5 +535,62 @@ int registration_start(struct registration *fit, const struct grid *grid, const 
 	for (int z = 0; z < fit->grid.size[2]; z++)
 		for (int y = 0; y < fit->grid.size[1]; y++)
 			interpolate_row(fit, grid, voxels, y, z);
+	return backend_cpu.volume_upload(fit->volume, fit->voxels, err);
+}
+
+/* Trilinear at a point, mm; 0 beyond the outermost voxels. */
+static double reference_at(const struct refine_reference *reference, const double point[3])
+{
+	const struct grid *grid = &reference->grid;
+	double share[3], sum = 0;
+	int below[3];
+
+	for (int a = 0; a < 3; a++) {
+		const double place = (point[a] - grid->origin[a]) / grid->spacing[a];
+
+		if (!(place >= 0 && place <= grid->size[a] - 1))
+			return 0;
+		below[a] = place < grid->size[a] - 1 ? (int)place : grid->size[a] - 2;
+		share[a] = place - below[a];
+	}
+	for (int i = 0; i < 8; i++) {
+		double weight = 1;
+
+		for (int a = 0; a < 3; a++)
+			weight *= i >> a & 1 ? share[a] : 1 - share[a];
+		sum += weight * (double)reference->voxels[grid_voxel(grid, below[0] + (i & 1), below[1] + (i >> 1 & 1),
+								     below[2] + (i >> 2 & 1))];
+	}
+	return sum;
+}
+
+/* Eight places within each voxel stand for all of it. */
+static void refer_row(struct registration *fit, const struct refine_reference *reference, int y, int z)
+{
+	const struct grid *grid = &fit->grid;
+
+	for (int x = 0; x < grid->size[0]; x++) {
+		const int at[3] = {x, y, z};
+		double sum = 0;
+
+		for (int i = 0; i < 8; i++) {
+			double point[3];
+
+			for (int a = 0; a < 3; a++)
+				point[a] = grid->origin[a] + (at[a] + ((i >> a & 1) - 0.5) / 2) * grid->spacing[a];
+			sum += reference_at(reference, point) / 8;
+		}
+		fit->voxels[grid_voxel(grid, x, y, z)] = (float)sum;
+	}
+}
+
+int registration_refer(struct registration *fit, const struct refine_reference *reference, struct error *err)
+{
+#pragma omp parallel for schedule(static)
+	for (int z = 0; z < fit->grid.size[2]; z++) {
+		for (int y = 0; y < fit->grid.size[1]; y++)
+			refer_row(fit, reference, y, z);
+		pulse_beat();
+	}
 	return backend_cpu.volume_upload(fit->volume, fit->voxels, err);
 }

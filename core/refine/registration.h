@@ -15,6 +15,7 @@ struct registration {
 	const struct refine_watch *watch;
 	enum refine_kind kind;
 	double alike;
+	bool referred;            /* the volume is a reference, and stays what it is */
 	bool cut;                 /* the body goes on beside the detector */
 	struct geometry geometry; /* of the bins, as the path moves it */
 	struct grid grid;
@@ -44,6 +45,7 @@ struct registration_options {
 	 * neighbours: its variance counts so many times.
 	 */
 	double alike;
+	bool referred;
 	int bins; /* the most voxels along the grid's sides, but for what is added for a body that is cut */
 	const struct refine_watch *watch; /* NULL: nobody watches */
 	/* Before the views have come: nothing is known of the body, and it is taken to be cut or not as `wide` says. */
@@ -65,6 +67,11 @@ int registration_iterate(struct registration *fit, struct error *err);
 int registration_step(struct registration *fit, struct path *path, struct error *err);
 /* Squares of the detail of each held-out view that the volume does not explain, [held_count], and their sum. */
 int registration_measure(struct registration *fit, double *ret_squares, double *ret_sum, struct error *err);
+/*
+ * Behind registration_measure, of the same views: by which factor the volume's detail stands in the views, the slope of
+ * the regression of what was measured upon it. About 1 for a volume of the object in its place, whatever the noise.
+ */
+int registration_alike(struct registration *fit, double *ret_alike, struct error *err);
 /* How many bins these are sums over. */
 double registration_bins(const struct registration *fit);
 
@@ -72,5 +79,7 @@ double registration_bins(const struct registration *fit);
 float *registration_keep_volume(struct registration *fit, struct error *err);
 /* The volume becomes that of another level's grid, trilinear; without `voxels` it is 0. */
 int registration_start(struct registration *fit, const struct grid *grid, const float *voxels, struct error *err);
+/* The volume becomes the reference's, in the mean over each voxel; outside of its grid 0. */
+int registration_refer(struct registration *fit, const struct refine_reference *reference, struct error *err);
 
 #endif

@@ -41,6 +41,8 @@ int image_put(void *context, struct request *request, struct error *err);
 int calibration_post(void *context, struct request *request, struct error *err);
 /* Of a body that names a job: what it has refined is kept. */
 int refinement_keep(struct api *api, const char *client, const cJSON *body, char ret_id[ID_SIZE], struct error *err);
+/* What only the other job tells of a job's reference: ERR_NOT_FOUND, ERR_CONFLICT, ERR_IMPOSSIBLE. */
+int reference_check(struct api *api, const struct job_request *wanted, struct error *err);
 int refinement_get(void *context, struct request *request, struct error *err);
 int calibration_list(void *context, struct request *request, struct error *err);
 int calibration_get(void *context, struct request *request, struct error *err);

@@ -36,7 +36,7 @@ static int post_resolved(struct api *api, struct job_request *wanted, struct sto
 	bool fresh;
 
 	if (job_request_resolve(wanted, stored_scan_measured(scan), err) != 0 ||
-	    send_resolve(api, stored_scan_parsed(scan), wanted, err) != 0 ||
+	    reference_check(api, wanted, err) != 0 || send_resolve(api, stored_scan_parsed(scan), wanted, err) != 0 ||
 	    supervise_check_devices(api->supervise, wanted, err) != 0 ||
 	    supervise_check_memory(api->supervise, stored_scan_measured(scan), wanted, &memory, err) != 0)
 		return err->code;

@@ -18,6 +18,9 @@ bool job_may_go(const struct job *job)
 {
 	const bool home = !job->entry.elsewhere && job->stays;
 
+	/* What it goes by is here. */
+	if (job->request.recipe.refine.reference[0] != '\0')
+		return false;
 	return !job->entry.held && !home && !job_is_mirror(&job->record) && job->unreadable.code == 0;
 }
 

@@ -37,6 +37,30 @@ static int add_present(struct message *message, struct stored_scan *scan, const 
 	return 0;
 }
 
+/* Names the volume that the refinement goes by, with its grid. */
+static int add_reference(struct store *store, struct message *message, struct error *err)
+{
+	const char *job = message->request.recipe.refine.reference;
+	struct volume_record *volumes;
+	int count, code;
+
+	if (job[0] == '\0')
+		return 0;
+	code = store_job_volumes(store, job, &volumes, &count, err);
+	if (code != 0)
+		return code;
+	code = error_set_at(err, ERR_NOT_FOUND, "/refine/reference/job",
+			    "the reference, job %s, has no volume any more", job);
+	for (int i = 0; i < count; i++)
+		if (strcmp(volumes[i].name, REFERENCE_VOLUME) == 0) {
+			message->grid = volumes[i].grid;
+			code = 0;
+		}
+	store_volume_path(store, job, REFERENCE_VOLUME, message->reference);
+	free(volumes);
+	return code;
+}
+
 /*
  * The reference to the scan is the caller's. The facts are from before anything
  * of the scan is read, here or by the worker: what changes from now on changes
@@ -64,6 +88,8 @@ static int make_start(struct supervise *supervise, const struct job *job, const 
 	code = job_request(job, &request, err);
 	if (code == 0)
 		code = job_request_copy(&message->request, request, err);
+	if (code == 0)
+		code = add_reference(store, message, err);
 	if (code == 0 && facts.closed)
 		code = add_present(message, scan, &facts, err);
 	if (code == 0)

@@ -550,6 +550,23 @@ static int remove_job(struct jobs *jobs, struct job *job, struct error *err)
 	return 0;
 }
 
+/* jobs->change is held. ERR_CONFLICT while a job that has not ended goes by this one's volume. */
+static int check_reference(struct jobs *jobs, const char *id, struct error *err)
+{
+	int code = 0;
+
+	pthread_mutex_lock(&jobs->lock);
+	for (int i = 0; i < jobs->count && code == 0; i++) {
+		const struct job *other = jobs->all[i];
+
+		if (!job_state_ended(other->record.state) && strcmp(other->request.recipe.refine.reference, id) == 0)
+			code = error_set(err, ERR_CONFLICT, "job %s, which is %s, refines with this one's volume",
+					 other->id, job_state_names[other->record.state]);
+	}
+	pthread_mutex_unlock(&jobs->lock);
+	return code;
+}
+
 int jobs_delete(struct jobs *jobs, struct job *job, bool *ret_removed, struct error *err)
 {
 	static const struct job_change asked = {.reason = "as asked"};
@@ -560,6 +577,8 @@ int jobs_delete(struct jobs *jobs, struct job *job, bool *ret_removed, struct er
 	job_facts(job, &facts);
 	if (facts.removed)
 		code = error_set(err, ERR_NOT_FOUND, "there is no job \"%s\" any more", facts.id);
+	else if (facts.ended && check_reference(jobs, facts.id, err) != 0)
+		code = err->code;
 	else if (facts.ended)
 		code = remove_job(jobs, job, err);
 	else if (facts.state == JOB_RUNNING || facts.attended)

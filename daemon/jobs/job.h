@@ -75,7 +75,8 @@ int jobs_list(struct jobs *jobs, const char *after, int limit, struct job **ret_
 /*
  * DELETE. A job that has not ended is asked to: waiting and queued ones are
  * cancelled on return, a running or attended one soon after (watch it). An ended job is
- * removed with its rows and files. *ret_removed says which it was.
+ * removed with its rows and files, ERR_CONFLICT while another one refines with its volume. *ret_removed says which it
+ * was.
  */
 int jobs_delete(struct jobs *jobs, struct job *job, bool *ret_removed, struct error *err);
 /* When an ended job goes for its age (store_limits.keep), seconds since 1970; INFINITY: it stays. */

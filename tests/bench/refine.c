@@ -294,7 +294,7 @@ static int refine(const struct scan *scan, enum refine_kind kind, struct geometr
 		if (reduced_wants(&reduced, k))
 			reduced_take(&reduced, k, scan->projections + (size_t)k * pixels);
 	if (code == 0)
-		code = refine_find(&reduced, &orbit, kind, BODY_WATER, NULL, ret_refinement, err);
+		code = refine_find(&reduced, &orbit, kind, BODY_WATER, NULL, NULL, ret_refinement, err);
 	if (code == 0)
 		code = geometry_copy(ret_geometry, &scan->said, err);
 	for (int k = 0; k < scan->said.count && code == 0; k++) {

@@ -310,13 +310,13 @@ test_a_recipe_file_with_options_over_it() {
 test_every_parameter_has_an_option() {
 	cbct submit X --print --grid 8,9,10 --spacing 0.5 --origin 1,2,3 --fdk cosine --cutoff 0.5 --truncation off --sart 9 --max-iterations 12 --relaxation 0.5 \
 		--subsets views --momentum --negative --stop-residual 0.1 --stop-change 0.2 --tv gradient --tv-alpha 0.3 --tv-strength light --tv-step 0.4 \
-		--tv-iterations 7 --tv-unit 1e-5 --tv-after-sart --projector matched --binning 2 --rings --refine-geometry --refine-motion --hold-out --metal 3000 --emit fdk,3 --priority urgent --devices 2 --mu-water 0.02 \
+		--tv-iterations 7 --tv-unit 1e-5 --tv-after-sart --projector matched --binning 2 --rings --refine-geometry --refine-motion --refine-reference 1m7yam2f9rgevqe7 --hold-out --metal 3000 --emit fdk,3 --priority urgent --devices 2 --mu-water 0.02 \
 		--reference-precision >"$work/printed.json"
 	jq -e '. == {scan: "X", grid: {size: [8, 9, 10], spacing_mm: [0.5, 0.5, 0.5], origin_mm: [1, 2, 3]},
 	    fdk: {window: "cosine", cutoff: 0.5, truncation: "off"},
 	    sart: {iterations: 9, max_iterations: 12, relaxation: 0.5, subsets: "views", momentum: true, nonnegative: false, stop: {residual: 0.1, change: 0.2}},
 	    tv: {method: "gradient", alpha: 0.3, strength: "light", step: 0.4, iterations: 7, unit: 1e-5, after: "sart"},
-	    projector: "matched", binning: 2, rings: true, refine: {geometry: true, motion: true}, hold_out: true, metal: {threshold_hu: 3000}, emit: ["fdk", 3], priority: "urgent", devices: 2, mu_water: 0.02, precision: "reference"}' \
+	    projector: "matched", binning: 2, rings: true, refine: {geometry: true, motion: true, reference: {job: "1m7yam2f9rgevqe7"}}, hold_out: true, metal: {threshold_hu: 3000}, emit: ["fdk", 3], priority: "urgent", devices: 2, mu_water: 0.02, precision: "reference"}' \
 		"$work/printed.json" >/dev/null || fail "each option in its place: $(cat "$work/printed.json")"
 	[ -z "$(jq -r --slurpfile document "$work/printed.json" '.job[].pointer | select(test("^/(cgls|fista)/") | not) |
 	    select([.[1:] / "/"] as [$path] | $document[0] | getpath($path) == null)' <(cbct parameters --json))" ] || fail "an option for every parameter"

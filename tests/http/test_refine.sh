@@ -119,5 +119,48 @@ test_a_refined_geometry_is_kept_for_the_arm_s_next_scan() {
 	expect_number "$(jq -n "($kept - $true) / ($nominal - $true)")" '<' 0.5 "the share of the circle's error above the true views' that stays"
 }
 
+refer() { # JOB [GRID]: a job of $scan that refines with that one's volume
+	req POST /v1/jobs -H 'Content-Type: application/json' -d "{\"scan\": \"$scan\", ${2:-$grid}, \"fdk\": {}, \"refine\": {\"geometry\": true, \"reference\": {\"job\": \"$1\"}}}"
+}
+# 30 noisy views are too few to be refined alone; the volume of a good scan of the same object says where they stood.
+test_few_noisy_views_are_refined_with_the_volume_of_another_job() {
+	local few=("${shape[@]/64/30}" --photons 3000) good plain refined waiting
+	grid='"grid": {"size": [40, 40, 40], "spacing_mm": [4, 4, 4]}' recipe="{\"scan\": \"SCAN\", $grid, "
+	cbct simulate "${few[@]}" --wobble 3 --kind matrices --truth "$work/head-truth.nii" --grid 40 --spacing 4 -o "$work/few" >/dev/null
+	cbct simulate "${few[@]}" -o "$work/few-nominal" >/dev/null
+	cp "$work/few-nominal/scan.json" "$work/few/scan.json"
+	plain=$(rmse_of "$work/few")
+	reconstruct "$work/fits" "$recipe"'"fdk": {}}'
+	good=$job
+	post_scan "$work/few"
+	refer nothing
+	expect_problem 404 /refine/reference/job
+	refer "$good" '"grid": {"size": [40, 40, 40], "spacing_mm": [4, 4, 4], "origin_mm": [10, 10, -10]}'
+	expect_problem 422 /refine/reference/job
+	req POST /v1/jobs -H 'Content-Type: application/json' -d "{\"scan\": \"$scan\", \"fdk\": {}, \"refine\": {\"reference\": {\"job\": \"$good\"}}}"
+	expect_problem 422 /refine/reference
+	req POST /v1/jobs -H 'Content-Type: application/json' -d "{\"scan\": \"$scan\", \"fdk\": {}, \"refine\": {\"geometry\": true, \"reference\": {\"volume\": 1}}}"
+	expect_problem 400 /refine/reference/volume
+	refer "$good"
+	expect_status 202
+	expect_json ".state == \"waiting\" and .refine == {geometry: true, motion: false, reference: {job: \"$good\"}}"
+	waiting=$(jq -r .id "$body")
+	refer "$waiting"
+	expect_problem 409 /refine/reference/job
+	req DELETE "/v1/jobs/$good"
+	expect_problem 409
+	post_projections "$work/few"
+	job=$waiting
+	wait_job succeeded
+	told geometry_refined
+	cbct get "$job" final -o "$work/head.nii" >/dev/null || fail "its volume"
+	refined=$(cbct compare --json "$work/head.nii" "$work/head-truth.nii" | jq .rmse)
+	expect_number "$refined" '<' "$(jq -n "$plain * .99")" "the error with the reference, below that without"
+	req GET "/v1/jobs/$job/refinement"
+	expect_json '.reference > 0.7 and .accepted'
+	req DELETE "/v1/jobs/$good"
+	expect_status 204
+}
+
 start_daemon
 run_tests

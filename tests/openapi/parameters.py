@@ -10,7 +10,7 @@ from typing import Any, Dict, Iterator, List
 
 # Members of the documents that are no parameters, or no scalars: their shapes are tested elsewhere.
 OTHERS = {
-    "job": {"/scan", "/preset", "/emit", "/labels", "/send", "/patient", "/where", "/resume"},
+    "job": {"/scan", "/preset", "/emit", "/labels", "/send", "/patient", "/where", "/resume", "/refine/reference"},
     "scan": {"/name", "/labels", "/patient", "/study", "/source", "/projections/air_region", "/projections/beam_hardening",
              "/projections/lag", "/projections/scatter"}
     | {f"/geometry/{name}" for name in ("kind", "angles_deg", "matrices", "views", "id", "notes")},

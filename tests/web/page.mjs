@@ -683,7 +683,7 @@ test('what was refined is drawn over the projections, stands in a table, and is 
 		const document = await (await route.fetch()).json()
 		await route.fulfill({ json: { ...document, refinement: `/v1/jobs/${finished}/refinement`, warnings: [{ code: 'geometry_refined', severity: 'info', summary: 'x', detail: 'x' }] } })
 	})
-	await page.route(`**/v1/jobs/${finished}/refinement`, route => route.fulfill({ json: { kind: 'geometry', accepted: true, rms_mm: 0.93, rms_deg: 0.25, most_mm: 1.4, most_deg: 0.36,
+	await page.route(`**/v1/jobs/${finished}/refinement`, route => route.fulfill({ json: { kind: 'geometry', accepted: true, reference: null, rms_mm: 0.93, rms_deg: 0.25, most_mm: 1.4, most_deg: 0.36,
 		held_out: { views: 4, better: 3, unexplained_before: 0.02, unexplained_after: 0.01 }, views, geometry: null } }))
 	await page.route('**/v1/calibrations', route => (kept.push(route.request().postDataJSON()), route.fulfill({ status: 202, json: { id: '1m83bhm0tp4wkcj4' } })))
 	await page.goto(`${origin}${finishedPath}`)
