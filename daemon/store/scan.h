@@ -52,7 +52,8 @@ struct stored_scan {
 	 * projections. */
 	struct scatter_images scatter;
 	int scatter_count;
-	unsigned char *scatter_progress, *scatter_lost;
+	unsigned char *scatter_progress;
+	unsigned char *scatter_lost;   /* 0: it is not */
 	unsigned *scatter_other;       /* as scatter_file_states tells it: a part of the scan's basis */
 	pthread_mutex_t scatter_files; /* held over each writing to the files of those images, and over their mend */
 	bool document_damaged;         /* scan.json */

@@ -11,6 +11,9 @@
 #include "proto/clock.h"
 #include "proto/scatter_file.h"
 
+/* Of scatter_lost: damaged by the disk; of no use any more, but its removal failed. */
+enum { LOST_BY_DAMAGE = 1, LOST_TO_REMOVE };
+
 static int open_file(const struct stored_scan *scan, bool writing, struct scatter_file *ret_file, bool *ret_whole,
 		     struct error *err)
 {
@@ -72,7 +75,7 @@ void stored_scan_count_scatter(const struct stored_scan *scan, struct scan_scatt
 	*ret = (struct scan_scatter){.images = scan->scatter, .count = scan->scatter_count};
 	for (int i = 0; i < scan->scatter_count; i++) {
 		ret->received += scan->scatter_progress[i] == STORED;
-		ret->lost += scan->scatter_lost[i];
+		ret->lost += scan->scatter_lost[i] != 0;
 		ret->wanted += scan->scatter_progress[i] != STORED && is_needed(scan, i);
 	}
 }
@@ -99,7 +102,7 @@ static int follow_records(struct stored_scan *scan, const unsigned char *states,
 			continue;
 		lost += scan->scatter_progress[i] == STORED && states[i] != SCATTER_STORED;
 		scan->scatter_progress[i] = states[i] == SCATTER_STORED ? STORED : MISSING;
-		scan->scatter_lost[i] = states[i] == SCATTER_LOST;
+		scan->scatter_lost[i] = states[i] == SCATTER_LOST ? LOST_BY_DAMAGE : 0;
 		scan->scatter_other[i] = others[i];
 	}
 	scan->losses += (unsigned)lost;
@@ -252,7 +255,7 @@ static void lose(struct stored_scan *scan, int image, float *buffer)
 		return;
 	}
 	pthread_mutex_lock(&scan->lock);
-	scan->scatter_lost[image] = 1;
+	scan->scatter_lost[image] = LOST_BY_DAMAGE;
 	scan->losses++;
 	pthread_mutex_unlock(&scan->lock);
 	note_lost(scan, image);
@@ -301,7 +304,7 @@ int store_load_scatter(struct stored_scan *scan, struct error *err)
 	if (code == 0 || code == ERR_NO_MEMORY)
 		return code;
 	log_line(LEVEL_ERROR, "scan %s: its images of scatter cannot be had: %s", scan->id, err->text);
-	memset(scan->scatter_lost, 1, (size_t)scan->scatter_count);
+	memset(scan->scatter_lost, LOST_BY_DAMAGE, (size_t)scan->scatter_count);
 	return 0;
 }
 
@@ -394,14 +397,37 @@ static int check_room(struct stored_scan *scan, int image, struct error *err)
 	return code;
 }
 
+/* The image was to be removed, and the disk failed then: it goes before another one comes. */
+static int finish_removal(struct stored_scan *scan, const struct scatter_file *file, int image, struct error *err)
+{
+	unsigned char *flags;
+	bool unfinished;
+	int code;
+
+	pthread_mutex_lock(&scan->lock);
+	unfinished = scan->scatter_lost[image] == LOST_TO_REMOVE;
+	pthread_mutex_unlock(&scan->lock);
+	if (!unfinished)
+		return 0;
+	flags = calloc((size_t)scan->scatter_count, 1);
+	if (flags == NULL)
+		return error_set_errno(err, ENOMEM, "list of %d images", scan->scatter_count);
+	flags[image] = 1;
+	code = scatter_file_forget(file, flags, err);
+	free(flags);
+	return code;
+}
+
 /* Who has begun with another image finds the scan's basis changed before it can read this one. */
 static int write_in_place(struct stored_scan *scan, const struct scatter_file *file, int image, const float *pixels,
 			  struct error *err)
 {
 	struct sum sum;
 	unsigned other;
-	int code = scatter_file_describe(file, image, pixels, &sum, &other, err);
+	int code = finish_removal(scan, file, image, err);
 
+	if (code == 0)
+		code = scatter_file_describe(file, image, pixels, &sum, &other, err);
 	if (code != 0)
 		return code;
 	pthread_mutex_lock(&scan->lock);
@@ -539,6 +565,8 @@ int store_remove_scatter(struct stored_scan *scan, int image, struct error *err)
 	if (code != 0)
 		goto out;
 	code = forget(scan, flags, err);
+	if (code == ERR_IO) /* for a moment, perhaps */
+		code = forget(scan, flags, err);
 	if (are_not_whole(code)) {
 		code = mend_and_check(scan, err);
 		if (code == 0)
@@ -548,9 +576,9 @@ int store_remove_scatter(struct stored_scan *scan, int image, struct error *err)
 	for (int i = 0; i < scan->scatter_count; i++) {
 		if (!flags[i])
 			continue;
-		/* What could not be removed is lost, and may be removed again. */
+		/* What could not be removed is lost: it goes with the next DELETE, or before another image comes. */
 		scan->scatter_progress[i] = MISSING;
-		scan->scatter_lost[i] = code != 0;
+		scan->scatter_lost[i] = code != 0 ? LOST_TO_REMOVE : 0;
 		scan->scatter_other[i] = 0;
 	}
 	scan->losses++; /* who has begun with it begins anew */

@@ -95,6 +95,34 @@ test_a_read_that_fails_once_is_no_damage() {
 	stop_daemon
 }
 
+test_an_image_of_scatter_that_could_not_be_removed_gives_place_to_another() {
+	put() { # BYTE: the image of projection 0
+		head -c 64 /dev/zero | tr '\0' "$1" >"$work/image.raw"
+		req PUT "/v1/scans/$scan/scatter/0" --data-binary @"$work/image.raw"
+	}
+	faulty_daemon
+	req POST /v1/scans -H 'Content-Type: application/json' --data-binary @<(jq '.projections += {quantity: "intensity", air: 60000,
+	    scatter: {kind: "images", columns: 4, rows: 4, every: 60}}' "$scan_dir/scan.json")
+	expect_status 201
+	scan=$(json .id)
+	put A
+	expect_status 201
+	fault open 5 scatter.raw 1 # once: it is tried again
+	req DELETE "/v1/scans/$scan/scatter/0"
+	expect_status 204
+	put A
+	expect_status 201
+	fault open 5 scatter.raw 2
+	req DELETE "/v1/scans/$scan/scatter/0"
+	expect_problem 500
+	put B
+	expect_status 201
+	req GET "/v1/scans/$scan/scatter/0"
+	cmp "$body" "$work/image.raw" || fail "the second image"
+	no_fault
+	stop_daemon
+}
+
 test_a_full_disk_can_be_emptied() {
 	local done_job filled=0
 	small_disk 24m
