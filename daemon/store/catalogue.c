@@ -132,6 +132,7 @@ int catalogue_open(struct catalogue *catalogue, bool *ret_fresh, bool *ret_inter
 	int version = 0, code;
 
 	close_database(catalogue);
+	atomic_store(&catalogue->site.damaged, false);
 	code = backend->look(&catalogue->site, &version, ret_interrupted, err);
 	if (code == 0 && version > CATALOGUE_VERSION)
 		code = error_set(err, ERR_CONFLICT,
@@ -176,7 +177,6 @@ unsigned long catalogue_losses(const struct catalogue *catalogue)
 int catalogue_set_aside(struct catalogue *catalogue, const char *why, struct error *err)
 {
 	close_database(catalogue);
-	atomic_store(&catalogue->site.damaged, false);
 	return catalogue->backend->set_aside(&catalogue->site, why, err);
 }
 

@@ -113,6 +113,12 @@ static int open_catalogue(struct store *store, bool rebuild, struct error *err)
 		unload(store);
 		code = load(store, err);
 	}
+	/* A read that failed for once is no damage: only what is found again is. */
+	if (code != 0 && catalogue_damaged(store->catalogue) && !rebuild) {
+		log_line(LEVEL_WARNING, "the catalogue is read once more: %s", err->text);
+		unload(store);
+		code = load(store, err);
+	}
 	if (code != 0 && catalogue_damaged(store->catalogue) && !rebuild) {
 		snprintf(why, sizeof(why), "the catalogue is damaged and made again from the directories: %.300s",
 			 err->text);

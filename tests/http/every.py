@@ -228,9 +228,7 @@ def one_run(build: str, work: str, every: Optional[str], rebuilt: bool = False, 
     ended(status, "the daemon")
     assert volume is None or volume == again, "the volume has other bytes after a restart"
     there = files(f"{work}/state")
-    # Who cannot read a page of the catalogue sets it aside, too.
-    aside = rebuilt or (every is not None and every.startswith("cbctd pread "))
-    extra = [name for name in there if name not in FILES and not (aside and name.startswith(SET_ASIDE))]
+    extra = [name for name in there if name not in FILES and not (rebuilt and name.startswith(SET_ASIDE))]
     assert not extra, f"files are left: {' '.join(extra)}"
     shutil.rmtree(f"{work}/state")
     return again

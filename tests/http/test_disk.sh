@@ -95,6 +95,33 @@ test_a_read_that_fails_once_is_no_damage() {
 	stop_daemon
 }
 
+test_a_read_of_the_catalogue_that_fails_once_is_no_damage() {
+	local passed
+	faulty_daemon
+	post_scan "$scan_dir"
+	post_projections "$scan_dir"
+	for passed in 0 1; do # each is tried twice
+		stop_daemon
+		fault pread 5 /catalogue.sqlite 2 "$passed"
+		LD_PRELOAD=$library start_daemon
+		[ "$(stat -c %s "$work/faults.count")" -gt "$passed" ] || fail "a read of the catalogue that failed"
+		req GET /v1/quarantine
+		expect_json '.entries == []'
+		req GET "/v1/scans/$scan"
+		expect_json '.missing == []'
+	done
+	# One that fails again is, and the catalogue is made again from the directories.
+	stop_daemon
+	fault pread 5 /catalogue.sqlite 4
+	LD_PRELOAD=$library start_daemon
+	req GET /v1/quarantine
+	expect_json '[.entries[].from] == ["catalogue.sqlite"]'
+	req GET "/v1/scans/$scan"
+	expect_json '.missing == []'
+	no_fault
+	stop_daemon
+}
+
 test_an_image_of_scatter_that_could_not_be_removed_gives_place_to_another() {
 	put() { # BYTE: the image of projection 0
 		head -c 64 /dev/zero | tr '\0' "$1" >"$work/image.raw"
