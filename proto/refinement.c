@@ -106,8 +106,10 @@ const char *refined_tell(const struct refined *refined, char *ret_detail, size_t
 	}
 	if (!refinement->accepted) {
 		snprintf(ret_detail, size,
-			 refinement->held_out > 0 ? "%d views that were held out do not agree better with any other"
-						  : "%d views could be held out: too few views, pixels or degrees",
+			 refinement->held_out > 0
+			     ? "%d views that were held out do not agree better with any other"
+			     : "%d views could be held out: too few views, pixels or degrees, or a "
+			       "detector that is displaced",
 			 refinement->held_out);
 		return "not_refined";
 	}

@@ -53,7 +53,7 @@ bool refine_is_possible(const struct geometry *geometry, const struct orbit *orb
 {
 	return geometry->count >= (is_referred ? VIEWS_LEAST / 2 : VIEWS_LEAST) && geometry->columns >= BINS_LEAST &&
 	       geometry->rows >= BINS_LEAST && orbit->arc >= (is_referred ? ARC_LEAST / 2 : ARC_LEAST) &&
-	       orbit->field_of_view > 0;
+	       orbit->field_of_view > 0 && (is_referred || !orbit->displaced);
 }
 
 double refine_place(const struct orbit *orbit, int view)

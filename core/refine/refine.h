@@ -20,7 +20,7 @@
  *
  * One view in eight has no part in volume and path. What the volume says of these views, moved as the path says, is
  * held against what the same iterations say of them without any motion; a path is kept only where that is better, and
- * where the path is larger than most that are found where there is nothing to find (one of 17 such scans keeps one, of
+ * where the path is larger than most that are found where there is nothing to find (one of 24 such scans keeps one, of
  * .06 mm, and is the better for it).
  *
  * A volume of the same object in the same world, of an earlier scan, can be the reference: then no volume is made, the
@@ -57,7 +57,11 @@ struct refinement {
 	double alike; /* of a reference's projections the share that the views' detail has, 1: the same; else 0 */
 };
 
-/* True if a scan has views, rows and columns enough; with a reference (`is_referred`) half of the views are. */
+/*
+ * True if a scan has views, rows and columns enough; with a reference (`is_referred`) half of the views are. Without
+ * one not of a displaced detector: opposite views do not show the same there, and held-out views preferred a path that
+ * made the image worse in both heads that need none (tests/bench/results/refine.txt).
+ */
 bool refine_is_possible(const struct geometry *geometry, const struct orbit *orbit, bool is_referred);
 /* Where a view stands on the path, radians from the first of the sweep on. */
 double refine_place(const struct orbit *orbit, int view);

@@ -463,6 +463,29 @@ START_TEST(a_reference_of_something_else_is_not_followed)
 }
 END_TEST
 
+/* Half of the object in each view: only a reference tells where these stood. */
+START_TEST(a_displaced_detector_needs_a_reference)
+{
+	const struct arm arm = {
+	    .columns = COLUMNS, .rows = ROWS, .count = VIEWS, .pixel = PIXEL, .first = .2, .step = 2 * M_PI / VIEWS};
+	struct geometry geometry;
+	struct orbit orbit;
+	struct error err;
+
+	for (int aside = 0; aside < 2; aside++) {
+		ck_assert_int_eq(arm_nominal_geometry(&arm, &geometry, &err), 0);
+		for (int k = 0; k < VIEWS && aside; k++)
+			for (int a = 0; a < 3; a++)
+				geometry.views[k].pixel0[a] += .3 * COLUMNS * geometry.views[k].column_step[a];
+		ck_assert_int_eq(orbit_analyse(&orbit, &geometry, &err), 0);
+		ck_assert(refine_is_possible(&geometry, &orbit, false) == !aside);
+		ck_assert(refine_is_possible(&geometry, &orbit, true));
+		orbit_clear(&orbit);
+		geometry_clear(&geometry);
+	}
+}
+END_TEST
+
 START_TEST(any_number_of_threads_finds_the_same)
 {
 #ifdef _OPENMP
@@ -490,6 +513,7 @@ Suite *refine_suite(void)
 	tcase_add_loop_test(paths, a_step_finds_what_made_the_residuals, 0, 2);
 	tcase_add_test(paths, what_all_views_share_is_no_path);
 	tcase_add_test(paths, halved_bins_are_those_of_larger_ones);
+	tcase_add_test(paths, a_displaced_detector_needs_a_reference);
 	suite_add_tcase(suite, paths);
 	tcase_set_timeout(scans, 300);
 	tcase_add_test(scans, a_detector_that_sways_is_found);
