@@ -59,6 +59,11 @@ def seconds(value):
     return f"{value:.3g}" if value >= 0.001 else f"{value:.1e}"
 
 
+def took(document, value):
+    """Seconds; none of a run beside which other programs had the processor."""
+    return "busy" if document.get("busy") else seconds(value)
+
+
 def device_name(document):
     return document["device_name"] or document["device"]
 
@@ -448,14 +453,15 @@ def better(report, results):
     for d in filter(None, map(results.best, names)):
         last, best = d["rows"][-1], least(d)
         cells = [f"{best['relative']:.4f} ({best['iteration']})", f"{last['relative']:.4f} ({last['iteration']})", f"{last['rmse_hu']:.1f}"]
-        rows.append((d["scan"], [d["scan"], d["title"], *cells, f"{last['ssim']:.4f}" if "ssim" in last else "", seconds(last["seconds"]), device_name(d)]))
+        rows.append((d["scan"], [d["scan"], d["title"], *cells, f"{last['ssim']:.4f}" if "ssim" in last else "", took(d, last["seconds"]), device_name(d)]))
     if not rows:
         return
     report.head("Beyond: nearer to the object")
     report.say(
         """The noisy scans and those of exact integrals by other methods. "arm" is the whole abdomen (3 mm CT on voxels of 1.5 mm) through
         the 248 calibrated matrices of a real C-arm, 197.6 degrees, 616 x 480 pixels with 20,000 photons in each, "arm-binned" the same
-        with 308 x 240 pixels of twice the side, 20,000 photons in each, too; their errors count the body in slices 16 to 95. In brackets the iteration. "Least" is over the volumes that were kept."""
+        with 308 x 240 pixels of twice the side, 20,000 photons in each, too; their errors count the body in slices 16 to 95. In brackets the iteration. "Least" is over the volumes that were kept.
+        "busy": other programs had the processor, and seconds say nothing."""
     )
     report.table(["scan", "method", "least error", "last error", "RMSE, HU", "SSIM", "seconds", "device"], [row for _, row in sorted(rows, key=lambda r: r[0])])
     shown = [(label, results.best(run)) for run, label in (("fig7-tv", "TV,"), ("fig7-proximal", "momentum, TV,"), ("fig7-fista", "FISTA,"))]
@@ -490,12 +496,12 @@ def stopping(report, results):
 
 def times(report, results):
     """Of what was run on more than one device."""
-    rows, devices = [], sorted({device for found in results.documents.values() for device in found if device != "cpu-1"}, key=lambda d: d != "cuda")
+    rows, devices = [], sorted({device for found in results.documents.values() for device in found if device != "cpu-1"}, key=lambda d: (d != "cuda", len(d), d))
     for run, found in results.documents.items():
         if len(set(found) & set(devices)) > 1:
-            took = [seconds(found[device]["rows"][-1]["seconds"]) if device in found else "" for device in devices]
+            each = [took(found[device], found[device]["rows"][-1]["seconds"]) if device in found else "" for device in devices]
             d = results.best(run)
-            rows.append([f"{d['scan']}: {d['title']}", d["rows"][-1]["iteration"], *took])
+            rows.append([f"{d['scan']}: {d['title']}", d["rows"][-1]["iteration"], *each])
     if rows:
         report.head("Seconds by device")
         report.say("FDK and all iterations of a job; cpu-N is the processor with N threads.")
