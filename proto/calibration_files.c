@@ -308,23 +308,41 @@ static double calibrated_turn(const struct calibrated *calibrated)
 	return atan2(sine, cosine);
 }
 
+/* Where the views go round in the order of their numbers. */
+struct way {
+	double net, whole; /* radians: the sum of the steps from view to view, and of their lengths */
+};
+
+static void way_add(struct way *way, double step)
+{
+	step = remainder(step, 2 * M_PI);
+	way->net += step;
+	way->whole += fabs(step);
+}
+
+/* Numbers that leap to and fro do not follow the arm: nothing is known of the way that it went. */
+static bool way_known(const struct way *way)
+{
+	return fabs(way->net) > 0.9 * way->whole;
+}
+
 /* Whether the angles run the calibrated way round: an arm sags otherwise on its way back. */
 static void check_direction(const struct calibrated *calibrated, const double *angles, int count, cJSON *notes)
 {
 	const struct geometry *sweep = &calibrated->sweep->geometry;
-	double was = 0, is = 0;
+	struct way was = {0}, is = {0};
 
 	for (int k = 0; k + 1 < sweep->count; k++)
-		was += remainder(source_angle(&sweep->views[k + 1]) - source_angle(&sweep->views[k]), 2 * M_PI);
+		way_add(&was, source_angle(&sweep->views[k + 1]) - source_angle(&sweep->views[k]));
 	for (int k = 0; k + 1 < count; k++)
-		is += remainder(angles[k + 1] - angles[k], 2 * M_PI);
-	if (was * is < 0)
+		way_add(&is, angles[k + 1] - angles[k]);
+	if (way_known(&was) && way_known(&is) && was.net * is.net < 0)
 		note(
 		    notes, "calibration_other_sweep",
 		    "the calibration was made %s over %.1f degrees, the scan runs %s over %.1f degrees: an arm may sag "
 		    "otherwise on its way back",
-		    was > 0 ? "counter-clockwise" : "clockwise", fabs(was) / degree,
-		    is > 0 ? "counter-clockwise" : "clockwise", fabs(is) / degree);
+		    was.net > 0 ? "counter-clockwise" : "clockwise", fabs(was.net) / degree,
+		    is.net > 0 ? "counter-clockwise" : "clockwise", fabs(is.net) / degree);
 }
 
 /*

@@ -4,6 +4,7 @@
 #include <math.h>
 #include <stdio.h>
 #include <stdlib.h>
+#include <string.h>
 
 #include "proto/calibration.h"
 
@@ -120,4 +121,10 @@ const char *refined_tell(const struct refined *refined, char *ret_detail, size_t
 		 refined->most[1], refinement->better, refinement->held_out,
 		 100 * (1 - refinement->held_after / refinement->held_before));
 	return motion ? "motion_followed" : "geometry_refined";
+}
+
+bool refined_told(const char *code)
+{
+	return strcmp(code, "geometry_refined") == 0 || strcmp(code, "motion_followed") == 0 ||
+	       strcmp(code, "not_refined") == 0;
 }

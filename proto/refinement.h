@@ -36,5 +36,7 @@ void refined_clear(struct refined *refined);
 cJSON *refined_json(const struct refined *refined);
 /* One sentence with the numbers, and the code of the warning that tells it. */
 const char *refined_tell(const struct refined *refined, char *ret_detail, size_t size);
+/* Whether a warning of this code is one of refined_tell's, which come after the document. */
+bool refined_told(const char *code);
 
 #endif

@@ -63,12 +63,6 @@ static int fetch_refinement(struct remote *remote, struct error *err)
 	return code;
 }
 
-static bool tells_of_refinement(const char *code)
-{
-	return strcmp(code, "geometry_refined") == 0 || strcmp(code, "motion_followed") == 0 ||
-	       strcmp(code, "not_refined") == 0;
-}
-
 static int tell_warnings(struct remote *remote, const cJSON *job, struct error *err)
 {
 	const cJSON *warnings = cJSON_GetObjectItemCaseSensitive(job, "warnings"), *warning;
@@ -82,7 +76,7 @@ static int tell_warnings(struct remote *remote, const cJSON *job, struct error *
 			continue;
 		snprintf(message.code_name, sizeof(message.code_name), "%s", member_text(warning, "code", ""));
 		snprintf(message.text, sizeof(message.text), "%s", member_text(warning, "detail", ""));
-		if (tells_of_refinement(message.code_name))
+		if (refined_told(message.code_name))
 			code = fetch_refinement(remote, err);
 		if (code == 0)
 			code = remote_tell(remote, &message, err);

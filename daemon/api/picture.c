@@ -361,8 +361,11 @@ static bool has_ended(struct picture *picture, struct request *request)
 	pthread_mutex_lock(&pictures->lock);
 	if (picture->state == WAITING && (clock_monotonic() >= picture->until || request_stopping(request))) {
 		leave(pictures, picture);
-		error_set(&picture->error, ERR_BUSY, "%d other pictures are being drawn or wait for it",
-			  pictures->statistics.waiting + pictures->statistics.drawing);
+		if (request_stopping(request))
+			error_set(&picture->error, ERR_BUSY, "the daemon ends, and draws nothing more");
+		else
+			error_set(&picture->error, ERR_BUSY, "%d other pictures are being drawn or wait for it",
+				  pictures->statistics.waiting + pictures->statistics.drawing);
 		end(picture, PICTURE_REFUSED);
 	}
 	ended = picture->state == ENDED;

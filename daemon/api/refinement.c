@@ -23,20 +23,23 @@ int refinement_get(void *context, struct request *request, struct error *err)
 /* The refinement of a job, where it is one that can be kept. */
 static int keepable(struct job *job, cJSON **ret_document, struct error *err)
 {
+	const struct job_request *asked;
 	struct job_facts facts;
 	cJSON *document = NULL;
-	int code = job_refinement(job, &document, err);
+	int code = job_request(job, &asked, err);
 
 	job_facts(job, &facts);
+	if (code == 0 && asked->recipe.refine.motion)
+		code =
+		    error_set(err, ERR_IMPOSSIBLE,
+			      "job %s follows a motion of the object, which is no place where an arm stood", facts.id);
+	if (code == 0)
+		code = job_refinement(job, &document, err);
 	if (code == ERR_NOT_FOUND)
 		code = error_set(err, ERR_IMPOSSIBLE, "job %s has refined no geometry", facts.id);
 	if (code == 0 && !cJSON_IsTrue(cJSON_GetObjectItemCaseSensitive(document, "accepted")))
 		code =
 		    error_set(err, ERR_CONFLICT, "job %s kept the geometry as it was: there is no other one", facts.id);
-	if (code == 0 && !cJSON_IsObject(cJSON_GetObjectItemCaseSensitive(document, "geometry")))
-		code = error_set(err, ERR_IMPOSSIBLE,
-				 "job %s has followed a motion of the object, which is no place where an arm stood",
-				 facts.id);
 	if (code == 0)
 		*ret_document = document;
 	else

@@ -66,6 +66,14 @@ test_a_sagging_arm_is_calibrated_and_its_scans_use_it() {
 	expect_json '.pointer == "/geometry/angles_deg"'
 	scan "{\"kind\": \"calibration\", \"id\": \"$calibration\", \"first_angle_deg\": 3, \"angle_step_deg\": -10}" 36
 	expect_warning calibration_other_sweep
+	# numbers that leap to and fro say nothing of the way that the arm went, whichever end is the first
+	local leaping
+	leaping=$(jq -nc '[range(36) | if . % 2 == 0 then . * 5 else 360 - . * 5 end]')
+	for leaping in "$leaping" "$(jq -c reverse <<<"$leaping")"; do
+		scan "{\"kind\": \"calibration\", \"id\": \"$calibration\", \"angles_deg\": $leaping}" 36
+		expect_status 201
+		expect_json '[.warnings[].code] | index("calibration_other_sweep") | not'
+	done
 	scan '{"kind": "calibration", "id": "00000000000000000"}'
 	expect_status 404
 	expect_json '.pointer == "/geometry/id"'

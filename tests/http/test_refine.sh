@@ -108,6 +108,14 @@ test_a_refined_geometry_is_kept_for_the_arm_s_next_scan() {
 		    assert kept["job"] == job and client.calibration(kept["id"])["geometry"] == client.refinement(job)["geometry"]
 	END
 	cbct calibrations | grep "^$(cat "$work/kept") .* right$" >/dev/null || fail "$(cbct calibrations)"
+	# A file that is gone is told as that, not as something that was never done.
+	mv "$state/jobs/$job/refinement.json" "$work/"
+	req GET "/v1/jobs/$job/refinement"
+	expect_problem 500
+	expect_json '.type == "urn:cbctd:problem:damaged"'
+	keep "$job"
+	expect_problem 500
+	mv "$work/refinement.json" "$state/jobs/$job/"
 
 	cbct simulate "${head[@]}" --wobble 3 --kind matrices --truth "$work/head-truth.nii" --grid 40 --spacing 4 -o "$work/head" >/dev/null
 	cbct simulate "${head[@]}" -o "$work/head-nominal" >/dev/null
