@@ -10,6 +10,7 @@ enum { COUNT_LEAST = 16, LIT_LEAST = 8 };
 /* A line integral that stands for no light at all, one that noise may change by any amount, and that of an object. */
 static const float NO_LIGHT = 10, STARVED = 5, OBJECT = 0.5F;
 static const float SHARE = 0.3F, ALLOWANCE = 0.05F; /* of the step */
+static const float SHARP = 0.6F;                    /* of the largest fall that a penumbra has between two bins */
 static const float PENUMBRA = 0.05F, PENUMBRA_LEAST = 0.02F;
 static const double WIDEST = 0.4, VIEWS = 0.85, FULL = 0.25, LESS = 0.3;
 
@@ -284,17 +285,35 @@ static bool reaches_edge(const struct edge *edge, int dark, const struct border 
 }
 
 /*
- * True if the values hardly change as far again on either side of the border. Where they go on, it is no edge but the
- * slope of a plate that is seen from above, or of the wall of a tube around the field.
+ * True if the values hardly change as far again on either side of the border, and the detector's edge is no nearer than
+ * that to more than two bins of it. Where they go on, it is no edge but the slope of a plate that is seen from above,
+ * or of the wall of a tube around the field.
  */
 static bool stands_alone(const struct edge *edge, int dark, int length, const struct border *border)
 {
 	const int inwards = dark + 2 * length, outwards = dark - length;
-	const float most = SHARE * border->step;
+	/* Half as much where nothing is seen outwards of it. */
+	const float most = (outwards < 0 ? 0.5F : 1) * SHARE * border->step;
 
 	return (inwards >= edge->profiles->bins ||
 		quantile_of(edge, dark + length, inwards, border->first, border->end, 0.5) <= most) &&
-	       (outwards < 0 || quantile_of(edge, outwards, dark, border->first, border->end, 0.5) <= most);
+	       (outwards < 0 ? length <= 2
+			     : quantile_of(edge, outwards, dark, border->first, border->end, 0.5) <= most);
+}
+
+/*
+ * True if the light grows over the border's bins as behind the edge of a collimator, by equal parts of it or more at
+ * once. Of a deep shadow the first of them takes most of the line integral; a disc that is seen nearly edge on takes
+ * equal parts of that.
+ */
+static bool is_an_edge(const struct edge *edge, int dark, int length, const struct border *border)
+{
+	const float least = SHARP * logf(1 + (expf(border->step) - 1) / (float)length);
+
+	for (int bin = dark; bin < dark + length; bin++)
+		if (quantile_of(edge, bin, bin + 1, border->first, border->end, VIEWS) >= least)
+			return true;
+	return length == 1;
 }
 
 /* The bins of the shadow's border that are partly in shadow are taken for shadow. */
@@ -318,7 +337,8 @@ static struct border find_border(const struct edge *edge)
 			struct border border;
 
 			if (!border_at(edge, dark, dark + length, &border) || border.step <= best.step ||
-			    !reaches_edge(edge, dark, &border) || !stands_alone(edge, dark, length, &border))
+			    !reaches_edge(edge, dark, &border) || !stands_alone(edge, dark, length, &border) ||
+			    !is_an_edge(edge, dark, length, &border))
 				continue;
 			border.bins = penumbra_end(edge, dark + length, &border);
 			if (border.bins <= most)

@@ -16,7 +16,8 @@
  * columns or rows, and ends within four bins: there the profiles fall by the same step, at least SHADOW_LEAST, to 30 %
  * of it and 0.05, in all segments and views, or by less where the object begins at the border and the shadow has air
  * behind it. An object has no such edge: its own step changes along it and from view to view, or goes on on one side,
- * as the slope of a plate does that is seen from above. 15 % of the views may differ in a segment, for metal and noise,
+ * as the slope of a plate does that is seen from above or of a tube's wall that leaves the detector, or falls by equal
+ * line integrals and not by equal parts of the light. 15 % of the views may differ in a segment, for metal and noise,
  * and segments at the ends that lie in a shadow of the other direction.
  *
  * None is found where nothing is seen beside the shadows: they might be all of a wide, flat object.

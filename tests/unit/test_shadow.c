@@ -17,9 +17,10 @@ static const float FLAT = 60000;
  * HEAD ends within the detector, WIDE nowhere; DISCS are seen edge on, as wide as the detector; the PLATE that a body
  * stands on is wider than the field and seen from above, the TUBE's wall lies just outside of it.
  */
-enum object { HEAD, WIDE, DISCS, METAL, FLAT_END, PLATE, TUBE, OBJECTS };
+enum object { HEAD, WIDE, DISCS, METAL, FLAT_END, PLATE, TUBE, NEAR_TUBE, TUBE_ASIDE, BROAD_DISC, OBJECTS };
 static const char *const names[] = {
-    "head", "wide body", "discs", "metal", "wide body that ends in the middle", "plate", "tube",
+    "head",  "wide body", "discs",       "metal",      "wide body that ends in the middle",
+    "plate", "tube",      "tube nearer", "tube aside", "disc",
 };
 static const struct ellipsoid objects[OBJECTS][PARTS_MOST] = {
     [HEAD] = {{.shape = SHAPE_ELLIPSOID, .semi_axes = {72, 84, 110}, .density = .035},
@@ -40,6 +41,14 @@ static const struct ellipsoid objects[OBJECTS][PARTS_MOST] = {
     [TUBE] = {{.shape = SHAPE_ELLIPSOID, .semi_axes = {72, 84, 110}, .density = .02},
 	      {.shape = SHAPE_CYLINDER, .semi_axes = {130, 130, 400}, .density = .04},
 	      {.shape = SHAPE_CYLINDER, .semi_axes = {122, 122, 400}, .density = -.04}},
+    [NEAR_TUBE] = {{.shape = SHAPE_ELLIPSOID, .semi_axes = {72, 84, 110}, .density = .02},
+		   {.shape = SHAPE_CYLINDER, .semi_axes = {115, 115, 400}, .density = .08},
+		   {.shape = SHAPE_CYLINDER, .semi_axes = {112, 112, 400}, .density = -.08}},
+    [TUBE_ASIDE] = {{.shape = SHAPE_ELLIPSOID, .semi_axes = {72, 84, 110}, .density = .02},
+		    {.shape = SHAPE_CYLINDER, .semi_axes = {130, 130, 400}, .centre = {15, 0, 0}, .density = .04},
+		    {.shape = SHAPE_CYLINDER, .semi_axes = {122, 122, 400}, .centre = {15, 0, 0}, .density = -.04}},
+    [BROAD_DISC] = {{.shape = SHAPE_CYLINDER, .semi_axes = {60, 60, 50}, .density = .0192},
+		    {.shape = SHAPE_CYLINDER, .semi_axes = {300, 300, 12}, .centre = {0, 0, -62}, .density = .0192}},
 };
 
 static unsigned random_state;
