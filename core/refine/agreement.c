@@ -24,11 +24,11 @@ static const double DOUBTFUL = 0.09, BEYOND_SIGMA = 2, WRONG = 0.15;
 static const double CUT_SHORT = 0.5, DISPLACED = 0.15;
 /*
  * What the shifts are of their doubts where views stand elsewhere, and the share that they are of what opposite rays
- * say of all detectors. Truncation and the faces of plates move parts of a view only: of 300 scans that fit those that
- * are cut reached 1.43, others 1.10. A flat that is off by 10 % along the columns moves the mean by .08 of what it
+ * say of all detectors. Truncation and the faces of plates move parts of a view only: of 447 scans that fit those that
+ * are cut reached 2.1, others 1.7. A flat that is off by 10 % along the columns moves the mean by .08 of what it
  * makes opposite rays say.
  */
-static const double FIRM = 1.25, FIRM_CUT = 1.5, ASIDE_LEAST = 0.15;
+static const double FIRM = 1.75, FIRM_CUT = 2.2, ASIDE_LEAST = 0.15;
 /* The unexplained share from which on the geometry is wrong: what fits stays below .3, truncated and noisy or not. */
 static const double UNEXPLAINED = 0.4;
 
