@@ -406,8 +406,10 @@ static int open_file(const char *path, int flags, int *ret_file, size_t *ret_siz
 	*ret_size = 0;
 	if (file < 0 && errno == ENOENT)
 		return 0;
-	if (file < 0)
-		return error_set_errno(err, errno, "open %s", path);
+	if (file < 0) { /* rights, descriptors: it may be whole */
+		error_set_errno(err, errno, "open %s", path);
+		return err->code = ERR_BUSY;
+	}
 	if (fstat(file, &status) != 0) {
 		error_set_errno(err, errno, "%s", path);
 		close(file);

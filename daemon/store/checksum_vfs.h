@@ -30,7 +30,10 @@ enum pages_kind {
 	PAGES_PLAIN,  /* without checksums: made by an earlier cbctd */
 	PAGES_CHECKED /* with them */
 };
-/* *ret_version: its user_version, as far as the log has not another. ERR_IO: it cannot be read, or is none. */
+/*
+ * *ret_version: its user_version, as far as the log has not another. ERR_IO: it cannot be read, or is none. ERR_BUSY,
+ * also of the next ones: it is there, and cannot be opened.
+ */
 int pages_look(const char *path, enum pages_kind *ret_kind, int *ret_version, struct error *err);
 /* Reads all pages of a file with checksums. ERR_IO: one is damaged, or some are missing; the text says which. */
 int pages_check(const char *path, struct error *err);

@@ -126,8 +126,7 @@ static int connection_open(struct connection *connection, struct error *err)
 	if (result == SQLITE_OK) {
 		sqlite3_busy_timeout(connection->db, 10000);
 		sqlite3_file_control(connection->db, "main", SQLITE_FCNTL_RESERVE_BYTES, &reserve);
-		/* The schema is read by statements within this one, whose results lose what says "damaged" otherwise.
-		 */
+		/* The schema is read by statements within this one, whose results lose what says "damaged". */
 		sqlite3_extended_result_codes(connection->db, 1);
 		result = sqlite3_exec(connection->db,
 				      "PRAGMA page_size = 4096; PRAGMA journal_mode = WAL; PRAGMA synchronous = FULL;"
@@ -484,16 +483,22 @@ static int look_at_files(const struct catalogue_site *site, enum pages_kind *ret
 	return code;
 }
 
+/* What could not be opened, or not be checked for want of memory, is not known to be damaged. */
+static int note_damage(struct catalogue_site *site, int code)
+{
+	if (code != 0 && code != ERR_BUSY && code != ERR_NO_MEMORY)
+		atomic_store(&site->damaged, true);
+	return code;
+}
+
 static int look(struct catalogue_site *site, int *ret_version, bool *ret_interrupted, struct error *err)
 {
 	enum pages_kind kind;
 	struct log_facts log;
 	int version = 0, code = look_at_files(site, &kind, &version, &log, err);
 
-	if (code != 0) {
-		atomic_store(&site->damaged, true);
+	if (note_damage(site, code) != 0)
 		return code;
-	}
 	*ret_version = kind != PAGES_NONE && log.frames > 0 && log.version >= 0 ? log.version : version;
 	*ret_interrupted = log.frames > 0 || log.commits_lost > 0;
 	return 0;
@@ -509,9 +514,7 @@ static int convert_plain(struct catalogue_site *site, struct error *err)
 	code = pages_look(path, &kind, &version, err);
 	if (code == 0 && kind == PAGES_PLAIN)
 		code = convert(site, err);
-	if (code != 0)
-		atomic_store(&site->damaged, true);
-	return code;
+	return note_damage(site, code);
 }
 
 /* Nobody but us may read who was scanned. */
@@ -551,10 +554,7 @@ static int empty_log(struct database *database, struct error *err)
 	if (code != 0)
 		return code;
 	catalogue_path(site, "", path);
-	code = pages_check(path, err);
-	if (code != 0)
-		atomic_store(&site->damaged, true);
-	return code;
+	return note_damage(site, pages_check(path, err));
 }
 
 static int take_verdict(void *context, const struct value *values, struct error *err)

@@ -110,6 +110,15 @@ test_a_read_of_the_catalogue_that_fails_once_is_no_damage() {
 		req GET "/v1/scans/$scan"
 		expect_json '.missing == []'
 	done
+	# Nor is one that cannot be opened: the start ends with the reason.
+	stop_daemon
+	fault open 13 state/catalogue.sqlite 1000
+	! LD_PRELOAD=$library timeout 20 "$BUILD/cbctd" --listen 127.0.0.1:0 --state-dir "$work/state" >"$work/refused" 2>&1 || fail "no start"
+	grep -q 'catalogue.sqlite: Permission denied' "$work/refused" || fail "the reason in $(cat "$work/refused")"
+	no_fault
+	LD_PRELOAD=$library start_daemon
+	req GET /v1/quarantine
+	expect_json '.entries == []'
 	# One that fails again is, and the catalogue is made again from the directories.
 	stop_daemon
 	fault pread 5 /catalogue.sqlite 4
