@@ -877,24 +877,49 @@ static int read_reference(struct reconstruction *reconstruction, struct refine_r
 	return code;
 }
 
+static int find_poses(struct reconstruction *reconstruction, struct refinement *ret_refinement, struct error *err)
+{
+	struct refine_reference reference = {.voxels = NULL};
+	int code = read_reference(reconstruction, &reference, err);
+
+	if (code == 0)
+		code = recon_refine(reconstruction->recon, reference.voxels != NULL ? &reference : NULL, ret_refinement,
+				    &reconstruction->poses, err);
+	free((void *)(uintptr_t)reference.voxels);
+	return code;
+}
+
+/* What the run has found whose checkpoint is gone on from. False where it is not there whole: it is found again then.
+ */
+static bool read_refined(const struct reconstruction *reconstruction, struct refinement *ret_refinement)
+{
+	cJSON *document = NULL;
+	struct error ignored;
+	char path[1200];
+	bool read = path_join(path, sizeof(path), reconstruction->run.directory, REFINEMENT_FILE, "", &ignored) == 0 &&
+		    sealed_read(path, &document, &ignored) == 0 &&
+		    refinement_parse(document, ret_refinement, &ignored) == 0;
+
+	cJSON_Delete(document);
+	return read;
+}
+
 /*
  * Called once all projections have been pushed. Where another geometry fits them better the reconstruction is opened
  * anew with it, *ret_again, and has none of them; a resumed one, too, to go on from its checkpoint.
  */
 static int heed_poses(struct reconstruction *reconstruction, bool *ret_again, struct error *err)
 {
-	struct refine_reference reference = {.voxels = NULL};
 	struct refinement refinement;
 	int code;
 
 	*ret_again = false;
 	if (!looks_for_poses(reconstruction))
 		return 0;
-	code = read_reference(reconstruction, &reference, err);
-	if (code == 0)
-		code = recon_refine(reconstruction->recon, reference.voxels != NULL ? &reference : NULL, &refinement,
-				    &reconstruction->poses, err);
-	free((void *)(uintptr_t)reference.voxels);
+	if (reconstruction->resumed && read_refined(reconstruction, &refinement))
+		code = recon_refine_again(reconstruction->recon, &refinement, &reconstruction->poses, err);
+	else
+		code = find_poses(reconstruction, &refinement, err);
 	if (code < 0)
 		return code;
 	reconstruction->refined = true;

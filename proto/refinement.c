@@ -1,6 +1,7 @@
 /* What a refinement has changed, for people and as a document: refinement.h. */
 #include "proto/refinement.h"
 
+#include <limits.h>
 #include <math.h>
 #include <stdio.h>
 #include <stdlib.h>
@@ -60,6 +61,18 @@ static void add_held_out(cJSON *json, const struct refinement *refinement)
 	cJSON_AddNumberToObject(held_out, "unexplained_after", refinement->held_after);
 }
 
+static cJSON *path_json(const struct path *path)
+{
+	cJSON *json = cJSON_CreateObject();
+
+	cJSON_AddBoolToObject(json, "of_views", path->of_views);
+	cJSON_AddNumberToObject(json, "length_rad", path->length);
+	cJSON_AddNumberToObject(json, "knots", path->knots);
+	json_add(json, "numbers", cJSON_CreateDoubleArray(path->numbers[0], PATH_NUMBERS * path->knots));
+	json_add(json, "common", cJSON_CreateDoubleArray(path->common, PATH_NUMBERS));
+	return json;
+}
+
 cJSON *refined_json(const struct refined *refined)
 {
 	const struct refinement *refinement = refined->refinement;
@@ -89,7 +102,68 @@ cJSON *refined_json(const struct refined *refined)
 		json_add(json, "geometry", matrices_json(refined->views, refined->count));
 	else
 		cJSON_AddNullToObject(json, "geometry");
+	json_add(json, "path", refinement->accepted ? path_json(&refinement->path) : cJSON_CreateNull());
 	return json;
+}
+
+static const double LARGE = 1e9; /* beyond any number of a refinement */
+
+static int path_parse(const cJSON *json, struct path *ret_path, struct error *err)
+{
+	struct path path = {.knots = 0};
+	struct json_reader reader;
+	long knots = 0;
+
+	json_begin(&reader, json, "/path", err);
+	json_bool(&reader, "of_views", true, &path.of_views);
+	json_number(&reader, "length_rad", true, 0, LARGE, &path.length);
+	json_integer(&reader, "knots", true, 4, PATH_KNOTS_MOST, &knots);
+	path.knots = (int)knots;
+	json_numbers(&reader, "numbers", true, PATH_NUMBERS * path.knots, -LARGE, LARGE, path.numbers[0]);
+	json_numbers(&reader, "common", true, PATH_NUMBERS, -LARGE, LARGE, path.common);
+	if (json_end(&reader) == 0)
+		*ret_path = path;
+	return reader.code;
+}
+
+static void held_out_parse(const cJSON *json, struct refinement *refinement, struct json_reader *outer)
+{
+	struct json_reader reader;
+	long views = 0, better = 0;
+
+	if (json == NULL)
+		return;
+	json_begin(&reader, json, "/held_out", outer->err);
+	json_integer(&reader, "views", true, 0, INT_MAX, &views);
+	json_integer(&reader, "better", true, 0, INT_MAX, &better);
+	json_number(&reader, "unexplained_before", true, 0, LARGE, &refinement->held_before);
+	json_number(&reader, "unexplained_after", true, 0, LARGE, &refinement->held_after);
+	outer->code = outer->code != 0 ? outer->code : json_end(&reader);
+	refinement->held_out = (int)views;
+	refinement->better = (int)better;
+}
+
+int refinement_parse(const cJSON *json, struct refinement *ret_refinement, struct error *err)
+{
+	static const char *const others[] = {"kind", "rms_mm", "rms_deg", "most_mm", "most_deg", "views", "geometry"};
+	struct refinement refinement = {.held_out = 0};
+	struct json_reader reader;
+	const cJSON *path;
+	int code;
+
+	json_begin(&reader, json, "", err);
+	for (size_t i = 0; i < sizeof(others) / sizeof(others[0]); i++)
+		json_member(&reader, others[i], true);
+	json_bool(&reader, "accepted", true, &refinement.accepted);
+	json_number(&reader, "reference", false, 0, LARGE, &refinement.alike);
+	held_out_parse(json_member(&reader, "held_out", true), &refinement, &reader);
+	path = json_member(&reader, "path", refinement.accepted);
+	code = json_end(&reader);
+	if (code == 0 && refinement.accepted)
+		code = path_parse(path, &refinement.path, err);
+	if (code == 0)
+		*ret_refinement = refinement;
+	return code;
 }
 
 const char *refined_tell(const struct refined *refined, char *ret_detail, size_t size)

@@ -367,12 +367,19 @@ int recon_refine(struct recon *recon, const struct refine_reference *reference, 
 	if (recon->refining != NULL)
 		code = refining_find(recon->refining, &recon->recipe, &recon->orbit, input->blank, input->counts.blank,
 				     reference, &watch, &refinement, err);
-	recon->work_done = recon->refine_from + recon->refine_work;
-	if (code == 0 && refinement.accepted)
-		code = move_views(recon, &refinement, ret_geometry, err);
+	recon->work_done = recon->refine_from;
+	if (code == 0)
+		code = recon_refine_again(recon, &refinement, ret_geometry, err);
 	if (code == 0)
 		*ret_refinement = refinement;
 	return code;
+}
+
+int recon_refine_again(struct recon *recon, const struct refinement *refinement, struct geometry *ret_geometry,
+		       struct error *err)
+{
+	recon->work_done += recon->refine_work;
+	return refinement->accepted ? move_views(recon, refinement, ret_geometry, err) : 0;
 }
 
 int recon_resume(struct recon *recon, const float *volume, int iteration, struct error *err)

@@ -129,6 +129,9 @@ int recon_push(struct recon *recon, const void *samples, const int *views, int c
  */
 int recon_refine(struct recon *recon, const struct refine_reference *reference, struct refinement *ret_refinement,
 		 struct geometry *ret_geometry, struct error *err);
+/* In its place where the same views have been refined before: goes by what was found then. */
+int recon_refine_again(struct recon *recon, const struct refinement *refinement, struct geometry *ret_geometry,
+		       struct error *err);
 /* The motion that it has found for a view: as path_motion. */
 void recon_motion(const struct recon *recon, const struct refinement *refinement, int view,
 		  double ret_motion[PATH_NUMBERS]);

@@ -166,6 +166,25 @@ test_few_noisy_views_are_refined_with_the_volume_of_another_job() {
 	expect_number "$refined" '<' "$(jq -n "$plain * .99")" "the error with the reference, below that without"
 	req GET "/v1/jobs/$job/refinement"
 	expect_json '.reference > 0.7 and .accepted'
+
+	# What was found is kept: a job that goes on from its checkpoint does not look for it again.
+	local reference=$state/jobs/$good/final.nii found
+	[ -e "$reference" ] || fail "the reference's voxels: $(ls "$state/jobs/$good"/*)"
+	req POST /v1/jobs -H 'Content-Type: application/json' -d "{\"scan\": \"$scan\", $grid, \"fdk\": {}, \"sart\": {\"iterations\": 300},
+		\"refine\": {\"geometry\": true, \"reference\": {\"job\": \"$good\"}}}"
+	expect_status 202
+	waiting=$(jq -r .id "$body")
+	until req GET "/v1/jobs/$waiting" && jq -e '.iteration >= 2' "$body" >/dev/null; do sleep 0.02; done
+	req GET "/v1/jobs/$waiting/refinement"
+	found=$(jq -cS . "$body")
+	mv "$reference" "$work/"
+	post_job "$recipe"'"fdk": {}, "priority": "stat"}'
+	wait_job succeeded
+	job=$waiting
+	wait_job succeeded
+	req GET "/v1/jobs/$waiting/refinement"
+	[ "$(jq -cS . "$body")" = "$found" ] || fail "what was found before"
+	mv "$work/final.nii" "$reference"
 	req DELETE "/v1/jobs/$good"
 	expect_status 204
 }
