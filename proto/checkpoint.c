@@ -391,31 +391,33 @@ int checkpointer_settled(struct checkpointer *checkpointer, bool wait, int *ret_
 struct checkpoint_facts {
 	int iteration, rows;
 	struct volume_noise noise;
-	size_t metal; /* bytes */
+	size_t state, metal; /* bytes */
 };
 
 static int check_checkpoint(const char *path, const char *bytes, const struct seal *seal, const struct recon *recon,
 			    struct checkpoint_facts *ret_facts, struct error *err)
 {
 	const struct grid *grid = recon_grid(recon);
-	const size_t state = recon_state_bytes(recon);
-	const size_t expected = CHECKPOINT_FILE_OFFSET + grid_voxels(grid) * sizeof(float) + state;
+	const size_t least = CHECKPOINT_FILE_OFFSET + grid_voxels(grid) * sizeof(float);
 	char text[CHECKPOINT_FILE_OFFSET + 1] = "", line[CHECKPOINT_FILE_OFFSET];
-	struct checkpoint_facts facts;
+	struct checkpoint_facts facts = {.state = 0};
 	int damaged = seal_first_damaged(seal, bytes);
 
 	if (damaged >= 0)
 		return error_set(err, ERR_INVALID, "%.200s: its block %d does not fit its checksum", path, damaged);
-	if (seal->content < expected)
-		return error_set(err, ERR_INVALID, "%.200s: %zu bytes, %zu are expected", path, seal->content,
-				 expected);
+	if (seal->content < least)
+		return error_set(err, ERR_INVALID, "%.200s: %zu bytes, at least %zu are expected", path, seal->content,
+				 least);
 	memcpy(text, bytes, CHECKPOINT_FILE_OFFSET);
-	if (sscanf(text, "cbctd checkpoint %d of %*d %*d %*d, metal %zu, rows %d, noise %la %la", &facts.iteration,
-		   &facts.metal, &facts.rows, &facts.noise.sigma, &facts.noise.contrast) != 5)
+	/* Without a state the line says nothing of it. */
+	if (sscanf(text, "cbctd checkpoint %d of %*d %*d %*d, metal %zu, rows %d, noise %la %la, state %zu",
+		   &facts.iteration, &facts.metal, &facts.rows, &facts.noise.sigma, &facts.noise.contrast,
+		   &facts.state) < 5)
 		return error_set(err, ERR_INVALID, "%.200s is no checkpoint", path);
-	checkpoint_line(line, facts.iteration, grid, state, facts.metal, facts.rows, &facts.noise);
+	checkpoint_line(line, facts.iteration, grid, facts.state, facts.metal, facts.rows, &facts.noise);
 	if (memcmp(line, bytes, sizeof(line)) != 0 || facts.rows != facts.iteration ||
-	    seal->content != expected + facts.metal + (size_t)facts.rows * ROW_BYTES)
+	    !recon_state_fits(recon, facts.state) ||
+	    seal->content != least + facts.state + facts.metal + (size_t)facts.rows * ROW_BYTES)
 		return error_set(err, ERR_INVALID, "%.200s is of another grid or algorithm", path);
 	*ret_facts = facts;
 	return 0;
@@ -449,7 +451,7 @@ static int resume_from(struct recon *recon, const char *path, int latest, struct
 		code = error_set(err, ERR_INVALID, "%.200s is of iteration %d: a volume of one before that is missing",
 				 path, facts.iteration);
 	at = CHECKPOINT_FILE_OFFSET + grid_voxels(recon_grid(recon)) * sizeof(float);
-	state = recon_state_bytes(recon);
+	state = facts.state;
 	if (code == 0)
 		code = read_history(bytes + at + state + facts.metal, facts.rows, history, err);
 	if (code == 0)

@@ -437,14 +437,26 @@ int recon_save_state(struct recon *recon, const struct checkpoint_sink *sink, st
 	return code;
 }
 
+/* Of a run that has no rim, or not yet. */
+static size_t state_without_rim(const struct recon *recon)
+{
+	return recon_state_bytes(recon) - rim_state_bytes(recon->rim);
+}
+
+bool recon_state_fits(const struct recon *recon, size_t size)
+{
+	const size_t whole = state_without_rim(recon);
+	const size_t rim = recon->rim != NULL ? rim_bytes(&recon->recipe.grid, &recon->orbit) : 0;
+
+	return size == whole || size == whole + rim;
+}
+
 int recon_resume_state(struct recon *recon, const char *bytes, size_t size, struct error *err)
 {
-	const size_t own = algorithm_bytes(recon), whole = recon_state_bytes(recon);
-	/* The rim stands behind the rest where the run had one. */
-	const size_t rim = recon->rim != NULL ? rim_bytes(&recon->recipe.grid, &recon->orbit) : 0;
+	const size_t own = algorithm_bytes(recon), whole = state_without_rim(recon);
 	int code = 0;
 
-	if (!recon->resumed || (size != whole && size != whole + rim))
+	if (!recon->resumed || !recon_state_fits(recon, size))
 		return error_set(err, ERR_INVALID, "%zu bytes of an algorithm that holds %zu", size,
 				 recon_state_bytes(recon));
 	if (own > 0) {
@@ -456,7 +468,7 @@ int recon_resume_state(struct recon *recon, const char *bytes, size_t size, stru
 		ends_resume(recon->ends, bytes + own);
 	if (code == 0 && stopping_bytes(recon) > 0)
 		memcpy(&recon->stopping, bytes + own + ends_state_bytes(recon->ends), sizeof(recon->stopping));
-	if (code == 0 && size > whole)
+	if (code == 0 && size > whole) /* the rim stands behind the rest */
 		code = rim_resume(recon->rim, bytes + whole, err);
 	return code;
 }

@@ -169,6 +169,8 @@ struct checkpoint_sink {
  * bytes where there is neither. A resumed run must get them back after recon_resume, to keep the same volumes.
  */
 size_t recon_state_bytes(const struct recon *recon);
+/* Whether a run of the same recipe may have had so many: what they hold depends on what it found in the projections. */
+bool recon_state_fits(const struct recon *recon, size_t size);
 int recon_save_state(struct recon *recon, const struct checkpoint_sink *sink, struct error *err);
 int recon_resume_state(struct recon *recon, const char *bytes, size_t size, struct error *err);
 

@@ -533,25 +533,33 @@ static void put_document(const char *projections)
 	put("scan.json", text, strlen(text));
 }
 
-/* A ball off the centre, from its exact line integrals. */
-static void put_scan(void)
+/* From exact line integrals. */
+static void put_scan_of(const struct phantom *phantom)
 {
 	static float projections[VIEWS][PIXELS];
-	const double shift[3] = {4, -6, 3};
-	struct phantom ball;
 	struct scan_files files;
 	struct error err = {0};
 
 	put_document("\"sample\":\"float32\",\"quantity\":\"line_integral\"");
 	put("projections.raw", projections, sizeof(projections));
 	ck_assert_int_eq(scan_files_open(directory, &files, &err), 0);
-	ck_assert_int_eq(phantom_named(&ball, "ball", 25, 0.02, &err), 0);
-	phantom_move(&ball, shift);
 	for (int i = 0; i < VIEWS; i++)
-		phantom_project(&ball, &files.scan->geometry, i, projections[i]);
-	phantom_clear(&ball);
+		phantom_project(phantom, &files.scan->geometry, i, projections[i]);
 	scan_files_close(&files);
 	put("projections.raw", projections, sizeof(projections));
+}
+
+/* A ball off the centre. */
+static void put_scan(void)
+{
+	const double shift[3] = {4, -6, 3};
+	struct phantom ball;
+	struct error err = {0};
+
+	ck_assert_int_eq(phantom_named(&ball, "ball", 25, 0.02, &err), 0);
+	phantom_move(&ball, shift);
+	put_scan_of(&ball);
+	phantom_clear(&ball);
 }
 
 START_TEST(a_scan_directory_is_read)
@@ -999,6 +1007,26 @@ START_TEST(a_run_that_yields_goes_on_to_the_same_bits)
 }
 END_TEST
 
+/* The rim of the field of view is in its checkpoints, and what begins anew has none yet. */
+START_TEST(a_body_wider_than_the_detector_goes_on_from_its_checkpoint)
+{
+	static const char request[] = "{\"scan\":\"s\",\"grid\":{\"size\":[24,20,12],\"spacing_mm\":[4,5,6]},"
+				      "\"fdk\":{},\"sart\":{\"iterations\":4,\"subsets\":3},\"emit\":[2,4]}";
+	struct ellipsoid body = {SHAPE_CYLINDER, {60, 60, 200}, {0, 0, 0}, 0, 0.02};
+	struct watched whole = {0}, first = {.yield_at = 2}, second = {0};
+	struct error err = {0};
+	char checkpoint[200];
+
+	put_scan_of(&(struct phantom){1, &body});
+	snprintf(checkpoint, sizeof(checkpoint), "%s/%s", out, CHECKPOINT_FILE);
+	ck_assert_int_eq(run(request, out, NULL, 0, &whole, &err), 0);
+	ck_assert_ptr_nonnull(strstr(whole.warnings, "truncated"));
+	ck_assert_int_eq(run(request, out, NULL, 0, &first, &err), ERR_BUSY);
+	ck_assert_msg(run(request, out, checkpoint, 2, &second, &err) == 0, "%s", err.text);
+	ck_assert_mem_eq(second.sha256[second.kept - 1], whole.sha256[whole.kept - 1], 32);
+}
+END_TEST
+
 START_TEST(a_checkpoint_that_is_newer_brings_its_history_and_serves_where_no_volume_is_missing)
 {
 	struct watched first = {.yield_at = 3}, second = {0}, third = {.yield_at = 2}, fourth = {0};
@@ -1145,6 +1173,7 @@ Suite *scan_directory_suite(void)
 	tcase_add_test(pipelines, projections_that_make_no_sense_are_refused);
 	tcase_add_test(pipelines, a_scan_of_what_is_there_is_as_if_no_more_had_been_planned);
 	tcase_add_test(pipelines, a_run_that_yields_goes_on_to_the_same_bits);
+	tcase_add_test(pipelines, a_body_wider_than_the_detector_goes_on_from_its_checkpoint);
 	tcase_add_test(pipelines, a_checkpoint_that_is_newer_brings_its_history_and_serves_where_no_volume_is_missing);
 	tcase_add_test(pipelines, a_checkpoint_of_something_else_is_refused);
 	tcase_add_test(pipelines, a_run_that_is_stopped_leaves_nothing_half_written);
