@@ -207,11 +207,13 @@ static bool body_is_broken(struct connection *connection)
 
 /*
  * A reply whose length nobody knew, and whose client reads it slower than the minimum rate for as long as any body may
- * be late. A stream that has nothing to say is suspended.
+ * be late. A stream that has nothing to say is suspended, and one that says little now and then is not slow where its
+ * client has taken all but the last of it.
  */
 static bool is_stalled(struct connection *connection, double now)
 {
 	const struct http_options *options = &connection->http->options;
+	const size_t little = 4096; /* of a longer reply the socket holds more */
 	uint64_t taken;
 
 	if (connection->phase != PHASE_SEND || connection->bytes != UNKNOWN_SIZE)
@@ -219,8 +221,9 @@ static bool is_stalled(struct connection *connection, double now)
 	taken = live_acknowledged(connection);
 	if (taken == UNKNOWN_SIZE) /* a Unix socket holds little */
 		taken = connection->made;
-	if (connection->suspended || (double)(taken - connection->taken_then) >=
-					 (double)options->minimum_rate * fmax(1, now - connection->kept_up_at)) {
+	if (connection->suspended || live_untaken(connection) < little ||
+	    (double)(taken - connection->taken_then) >=
+		(double)options->minimum_rate * fmax(1, now - connection->kept_up_at)) {
 		connection->taken_then = taken;
 		connection->kept_up_at = now;
 	}

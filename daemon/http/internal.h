@@ -263,6 +263,8 @@ bool live_hung_up(const struct connection *connection);
 bool live_peer_gone(struct connection *connection, double now);
 /* Bytes that the peer has acknowledged so far; UNKNOWN_SIZE on a Unix socket. */
 uint64_t live_acknowledged(const struct connection *connection);
+/* Bytes that were sent and that the peer has not taken yet. */
+size_t live_untaken(const struct connection *connection);
 
 /* ---- http/request.c: what the request line and headers say ---- */
 struct request *request_new(struct http *http, struct connection *connection, const char *target);

@@ -11,6 +11,7 @@
 
 #include <errno.h>
 #include <math.h>
+#include <linux/sockios.h>
 #include <linux/tcp.h> /* the C library's has not all of struct tcp_info */
 #include <netinet/in.h>
 #include <poll.h>
@@ -58,6 +59,13 @@ uint64_t live_acknowledged(const struct connection *connection)
 
 	return getsockopt(connection->socket, IPPROTO_TCP, TCP_INFO, &info, &size) == 0 ? info.tcpi_bytes_acked
 											: UNKNOWN_SIZE;
+}
+
+size_t live_untaken(const struct connection *connection)
+{
+	int bytes = 0;
+
+	return ioctl(connection->socket, SIOCOUTQ, &bytes) == 0 && bytes > 0 ? (size_t)bytes : 0;
 }
 
 /*

@@ -198,6 +198,24 @@ test_peers_that_vanish_are_let_go() {
 	timeout 180 unshare -rn bash "$here/vanish.sh" "$scan_dir"
 }
 
+# Each event is acknowledged by the client's kernel at once: a rate that no stream of events reaches is no reason to end it.
+test_a_stream_that_says_little_is_not_called_slow() {
+	uploaded_scan
+	post_job '{"scan": "SCAN", "grid": {"size": [8, 8, 4], "spacing_mm": [8, 8, 8]}, "sart": {"iterations": 100000, "subsets": 1}}'
+	until req GET "/v1/jobs/$job" && jq -e '.state == "running"' "$body" >/dev/null; do sleep 0.1; done
+	stop_daemon
+	start_daemon --transfer-grace 0.1 --minimum-rate 1G
+	local events=0 tries=0
+	# A reply that is asked for may itself come too late for such a rate: until the stream is there.
+	until [ $events -gt 0 ] || [ $((tries++)) = 100 ]; do
+		events=$(curl -sN --max-time 60 "$url/v1/jobs/$job/events?after=latest" | grep -m 300 -c '^id:') || true
+	done
+	[ "$events" = 300 ] || fail "300 events, the stream was ended behind $events"
+	stop_daemon
+	start_daemon
+	req DELETE "/v1/jobs/$job"
+}
+
 test_a_cancelled_job_ends_its_watchers() {
 	uploaded_scan
 	post_job "$slow"

@@ -1081,8 +1081,8 @@ test('"reconstruct again" shows what is wrong at its field, then posts a job', a
 	const page = await openFinished()
 	const field = pointer => `dialog [name="${pointer}"]`
 	await page.click('button:has-text("Reconstruct again")')
-	const cards = await page.$$eval('dialog .preset', all => all.map(card => card.textContent))
-	expect(cards.length === 7 && cards.filter(text => /about [\d.]+ (s|min)/.test(text)).length === 6, `a card for each purpose with its time, got ${cards}`)
+	const cards = () => page.$$eval('dialog .preset', all => all.map(card => card.textContent))
+	await until('a card for each purpose with its time', cards, texts => texts.length === 7 && texts.filter(text => /about [\d.]+ (s|min)/.test(text)).length === 6)
 	expect((await page.textContent('dialog .expert summary')).includes('FDK + SART 7 + TV'), 'what the fold holds')
 	await page.setViewportSize({ width: 1366, height: 768 })
 	await shoot(page, 'presets')
