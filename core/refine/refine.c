@@ -211,6 +211,27 @@ static int run_still(struct run *run, struct registration *fit, const struct sch
 	return code == 0 ? registration_measure(fit, run->squares[0], ret_sum, err) : code;
 }
 
+/* Steps of the path, and between them iterations of the volume where that is no reference. */
+static int follow_path(struct run *run, struct registration *fit, const struct schedule *schedule, struct path *path,
+		       struct error *err)
+{
+	int code = 0;
+
+	for (int doubled = 0; doubled <= schedule->doublings && code == 0; doubled++) {
+		if (doubled > 0)
+			path_double(path);
+		for (int i = 0; i < schedule->steps && code == 0; i++) {
+			code = registration_step(fit, path, err);
+			tell_work(run, STEP_WORK);
+			if (code == 0)
+				code = registration_place(fit, path, err);
+			if (code == 0 && run->reference == NULL)
+				code = iterate(run, fit, 1, err);
+		}
+	}
+	return code;
+}
+
 static int run_moved(struct run *run, struct registration *fit, const struct schedule *schedule, struct path *path,
 		     double *ret_sum, struct error *err)
 {
@@ -220,18 +241,8 @@ static int run_moved(struct run *run, struct registration *fit, const struct sch
 		code = registration_start(fit, &run->grid, run->volumes[1], err);
 	if (code == 0)
 		code = iterate(run, fit, schedule->warm, err);
-	for (int doubled = 0; doubled <= schedule->doublings && code == 0; doubled++) {
-		if (doubled > 0)
-			path_double(path);
-		for (int i = 0; i < schedule->steps && code == 0; i++) {
-			code = registration_step(fit, path, err);
-			tell_work(run, STEP_WORK);
-			if (code == 0)
-				code = registration_place(fit, path, err);
-			if (code == 0)
-				code = iterate(run, fit, 1, err);
-		}
-	}
+	if (code == 0)
+		code = follow_path(run, fit, schedule, path, err);
 	return code == 0 ? registration_measure(fit, run->squares[1], ret_sum, err) : code;
 }
 
@@ -248,16 +259,8 @@ static int run_referred(struct run *run, struct registration *fit, const struct 
 		code = registration_measure(fit, run->squares[0], &ret_sums[0], err);
 	if (code == 0)
 		code = registration_place(fit, path, err);
-	for (int doubled = 0; doubled <= schedule->doublings && code == 0; doubled++) {
-		if (doubled > 0)
-			path_double(path);
-		for (int i = 0; i < schedule->steps && code == 0; i++) {
-			code = registration_step(fit, path, err);
-			tell_work(run, STEP_WORK);
-			if (code == 0)
-				code = registration_place(fit, path, err);
-		}
-	}
+	if (code == 0)
+		code = follow_path(run, fit, schedule, path, err);
 	if (code == 0)
 		code = registration_measure(fit, run->squares[1], &ret_sums[1], err);
 	return code == 0 ? registration_alike(fit, &refinement->alike, err) : code;
