@@ -133,7 +133,7 @@ static bool run_yield(void *context)
 	if (hooks->recon.yield != NULL && hooks->recon.yield(hooks->recon.context))
 		return true;
 	/* The run's next question is whether it is cancelled, which the trouble answers. */
-	if (run->checkpointer != NULL && run->trouble.code == 0)
+	if (run->checkpointer != NULL && run->trouble.code == 0 && recon_iteration(run->recon) > 0)
 		keep_checkpoint(run, &run->trouble);
 	return false;
 }
@@ -889,16 +889,20 @@ static int find_poses(struct reconstruction *reconstruction, struct refinement *
 	return code;
 }
 
-/* What the run has found whose checkpoint is gone on from. False where it is not there whole: it is found again then.
+/*
+ * What the run has found whose checkpoint is gone on from, or one that ended before it had any and went by the same.
+ * False where it is not there whole: it is found again then.
  */
 static bool read_refined(const struct reconstruction *reconstruction, struct refinement *ret_refinement)
 {
 	cJSON *document = NULL;
 	struct error ignored;
 	char path[1200];
-	bool read = path_join(path, sizeof(path), reconstruction->run.directory, REFINEMENT_FILE, "", &ignored) == 0 &&
+	bool read = reconstruction->run.sealed &&
+		    path_join(path, sizeof(path), reconstruction->run.directory, REFINEMENT_FILE, "", &ignored) == 0 &&
 		    sealed_read(path, &document, &ignored) == 0 &&
-		    refinement_parse(document, ret_refinement, &ignored) == 0;
+		    refinement_parse(document, ret_refinement, &ignored) == 0 &&
+		    (reconstruction->resumed || ret_refinement->basis == recon_refine_basis(reconstruction->recon));
 
 	cJSON_Delete(document);
 	return read;
@@ -916,7 +920,7 @@ static int heed_poses(struct reconstruction *reconstruction, bool *ret_again, st
 	*ret_again = false;
 	if (!looks_for_poses(reconstruction))
 		return 0;
-	if (reconstruction->resumed && read_refined(reconstruction, &refinement))
+	if (read_refined(reconstruction, &refinement))
 		code = recon_refine_again(reconstruction->recon, &refinement, &reconstruction->poses, err);
 	else
 		code = find_poses(reconstruction, &refinement, err);
@@ -925,6 +929,8 @@ static int heed_poses(struct reconstruction *reconstruction, bool *ret_again, st
 	reconstruction->refined = true;
 	*ret_again = refinement.accepted || reconstruction->resumed;
 	code = tell_refinement(reconstruction, &refinement, err);
+	if (code == 0 && run_yield(&reconstruction->run))
+		return error_set(err, ERR_BUSY, "yielded once the geometry was refined");
 	return code == 0 && *ret_again ? open_again(reconstruction, err) : code;
 }
 
@@ -1365,7 +1371,8 @@ int reconstruction_finish(struct reconstruction *reconstruction, struct error *e
 		*err = run->trouble;
 		return run->trouble.code;
 	}
-	if (code == ERR_BUSY && checkpoint_save(reconstruction->recon, &run->history, run->directory, &trouble) != 0) {
+	if (code == ERR_BUSY && recon_iteration(reconstruction->recon) > 0 &&
+	    checkpoint_save(reconstruction->recon, &run->history, run->directory, &trouble) != 0) {
 		*err = trouble;
 		code = trouble.code;
 	}

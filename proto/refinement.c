@@ -1,6 +1,7 @@
 /* What a refinement has changed, for people and as a document: refinement.h. */
 #include "proto/refinement.h"
 
+#include <inttypes.h>
 #include <limits.h>
 #include <math.h>
 #include <stdio.h>
@@ -77,6 +78,7 @@ cJSON *refined_json(const struct refined *refined)
 {
 	const struct refinement *refinement = refined->refinement;
 	cJSON *json = cJSON_CreateObject(), *list;
+	char basis[17];
 
 	cJSON_AddStringToObject(json, "kind", refined->kind == REFINE_MOTION ? "motion" : "geometry");
 	cJSON_AddBoolToObject(json, "accepted", refinement->accepted);
@@ -102,6 +104,8 @@ cJSON *refined_json(const struct refined *refined)
 		json_add(json, "geometry", matrices_json(refined->views, refined->count));
 	else
 		cJSON_AddNullToObject(json, "geometry");
+	snprintf(basis, sizeof(basis), "%016" PRIx64, refinement->basis);
+	cJSON_AddStringToObject(json, "basis", basis);
 	json_add(json, "path", refinement->accepted ? path_json(&refinement->path) : cJSON_CreateNull());
 	return json;
 }
@@ -148,6 +152,7 @@ int refinement_parse(const cJSON *json, struct refinement *ret_refinement, struc
 	static const char *const others[] = {"kind", "rms_mm", "rms_deg", "most_mm", "most_deg", "views", "geometry"};
 	struct refinement refinement = {.held_out = 0};
 	struct json_reader reader;
+	char basis[17] = ""; /* documents of earlier versions have none */
 	const cJSON *path;
 	int code;
 
@@ -157,8 +162,10 @@ int refinement_parse(const cJSON *json, struct refinement *ret_refinement, struc
 	json_bool(&reader, "accepted", true, &refinement.accepted);
 	json_number(&reader, "reference", false, 0, LARGE, &refinement.alike);
 	held_out_parse(json_member(&reader, "held_out", true), &refinement, &reader);
+	json_string(&reader, "basis", false, basis, sizeof(basis));
 	path = json_member(&reader, "path", refinement.accepted);
 	code = json_end(&reader);
+	refinement.basis = strtoull(basis, NULL, 16);
 	if (code == 0 && refinement.accepted)
 		code = path_parse(path, &refinement.path, err);
 	if (code == 0)

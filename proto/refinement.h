@@ -10,7 +10,7 @@
  *
  *   {"kind": "geometry" | "motion", "accepted", "held_out": {"views", "better", "unexplained_before",
  *    "unexplained_after"}, "reference": refinement.alike, or null, "rms_mm", "rms_deg", "most_mm", "most_deg",
- *    "views": [{"projection", "shift_mm": [3], "turn_deg": [3]}, ...], "geometry": matrices, or null}
+ *    "views": [{"projection", "shift_mm": [3], "turn_deg": [3]}, ...], "geometry": matrices, or null, "basis"}
  *
  * Changes are those of refine_change. Where none was accepted `views` is empty. The geometry is the whole detector's,
  * in the order of `views`; null where none was accepted, and of a motion, which is no place where an arm stood.

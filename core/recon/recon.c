@@ -352,10 +352,37 @@ static void tell_refining(void *context, double share)
 	recon_tell_progress(recon, recon_runs_fdk(recon) ? STAGE_FDK : STAGE_LOAD, recon->iteration);
 }
 
+uint64_t recon_refine_basis(struct recon *recon)
+{
+	const struct input *input = &recon->input;
+
+	refining_leave_out(recon->refining, input->blank, input->counts.blank);
+	return recon->refining == NULL ? 0 : refining_basis(recon->refining, &recon->recipe, &recon->orbit);
+}
+
+/* Who asks between the steps of a refinement whether it goes on. */
+struct asking {
+	const struct recon *recon;
+	bool yields;
+};
+
+static bool must_leave(void *context)
+{
+	struct asking *asking = context;
+	const struct recon_hooks *hooks = asking->recon->hooks;
+
+	if (hooks->cancelled != NULL && hooks->cancelled(hooks->context))
+		return true;
+	asking->yields = hooks->yield != NULL && hooks->yield(hooks->context);
+	return asking->yields;
+}
+
 int recon_refine(struct recon *recon, const struct refine_reference *reference, struct refinement *ret_refinement,
 		 struct geometry *ret_geometry, struct error *err)
 {
-	const struct refine_watch watch = {&recon->cancel, tell_refining, recon};
+	struct asking asking = {.recon = recon};
+	const struct cancel leave = {must_leave, &asking};
+	const struct refine_watch watch = {&leave, tell_refining, recon};
 	const struct input *input = &recon->input;
 	struct refinement refinement = {.held_out = 0};
 	int code = 0;
@@ -364,9 +391,12 @@ int recon_refine(struct recon *recon, const struct refine_reference *reference, 
 		return error_set(err, ERR_CONFLICT, "%d of %d views have come", recon->pushed_count,
 				 recon->geometry->count);
 	recon->refine_from = recon->work_done;
+	refining_leave_out(recon->refining, input->blank, input->counts.blank);
 	if (recon->refining != NULL)
-		code = refining_find(recon->refining, &recon->recipe, &recon->orbit, input->blank, input->counts.blank,
-				     reference, &watch, &refinement, err);
+		code =
+		    refining_find(recon->refining, &recon->recipe, &recon->orbit, reference, &watch, &refinement, err);
+	if (code == ERR_CANCELLED && asking.yields)
+		code = error_set(err, ERR_BUSY, "yielded while the geometry was refined");
 	recon->work_done = recon->refine_from;
 	if (code == 0)
 		code = recon_refine_again(recon, &refinement, ret_geometry, err);

@@ -65,7 +65,8 @@ struct recon_hooks {
 	bool (*cancelled)(void *context);
 	/*
 	 * Asked after each iteration but the last; true ends the run with ERR_BUSY:
-	 * recon_iteration and recon_read then give what recon_resume wants.
+	 * recon_iteration and recon_read then give what recon_resume wants. Asked often while the geometry is refined,
+	 * too; then there is no iteration to go on from, recon_iteration is 0.
 	 */
 	bool (*yield)(void *context);
 	/* Called at the beginning of a stage; the fraction is of the whole job, 0..1. */
@@ -129,7 +130,9 @@ int recon_push(struct recon *recon, const void *samples, const int *views, int c
  */
 int recon_refine(struct recon *recon, const struct refine_reference *reference, struct refinement *ret_refinement,
 		 struct geometry *ret_geometry, struct error *err);
-/* In its place where the same views have been refined before: goes by what was found then. */
+/* All but the reference that recon_refine would go by, as a number; refinement.basis of what was found has it. */
+uint64_t recon_refine_basis(struct recon *recon);
+/* In place of recon_refine where the same views have been refined before: goes by what was found then. */
 int recon_refine_again(struct recon *recon, const struct refinement *refinement, struct geometry *ret_geometry,
 		       struct error *err);
 /* The motion that it has found for a view: as path_motion. */

@@ -83,12 +83,21 @@ int refining_take(struct refining *refining, const struct backend *backend, stru
 	return code;
 }
 
-int refining_find(struct refining *refining, const struct recipe *recipe, const struct orbit *orbit, const int *blank,
-		  int blanks, const struct refine_reference *reference, const struct refine_watch *watch,
+void refining_leave_out(struct refining *refining, const int *blank, int blanks)
+{
+	for (int i = 0; i < blanks && refining != NULL; i++)
+		reduced_leave_out(&refining->reduced, blank[i]);
+}
+
+uint64_t refining_basis(const struct refining *refining, const struct recipe *recipe, const struct orbit *orbit)
+{
+	return refine_basis(&refining->reduced, orbit, refining->kind, recipe->mu_water);
+}
+
+int refining_find(const struct refining *refining, const struct recipe *recipe, const struct orbit *orbit,
+		  const struct refine_reference *reference, const struct refine_watch *watch,
 		  struct refinement *ret_refinement, struct error *err)
 {
-	for (int i = 0; i < blanks; i++)
-		reduced_leave_out(&refining->reduced, blank[i]);
 	return refine_find(&refining->reduced, orbit, refining->kind, recipe->mu_water, reference, watch,
 			   ret_refinement, err);
 }

@@ -17,9 +17,13 @@ int refining_bytes(const struct recipe *recipe, const struct geometry *geometry,
 /* Takes a view's line integrals. NULL is fine. */
 int refining_take(struct refining *refining, const struct backend *backend, struct stack *from, int slot, int view,
 		  struct error *err);
-/* Leaves views out that show nothing, and finds the motions. */
-int refining_find(struct refining *refining, const struct recipe *recipe, const struct orbit *orbit, const int *blank,
-		  int blanks, const struct refine_reference *reference, const struct refine_watch *watch,
+/* Leaves views out that show nothing: once all have come. NULL is fine. */
+void refining_leave_out(struct refining *refining, const int *blank, int blanks);
+/* Of what the motions will be found from: refine_basis. */
+uint64_t refining_basis(const struct refining *refining, const struct recipe *recipe, const struct orbit *orbit);
+/* Finds the motions. */
+int refining_find(const struct refining *refining, const struct recipe *recipe, const struct orbit *orbit,
+		  const struct refine_reference *reference, const struct refine_watch *watch,
 		  struct refinement *ret_refinement, struct error *err);
 /* What that takes, in FDKs of the whole scan, roughly; 0 for NULL. It is the processor that finds them. */
 int refining_work(const struct refining *refining, const struct grid *grid, int views, double *ret_work,

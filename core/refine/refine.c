@@ -83,6 +83,30 @@ void refine_change(enum refine_kind kind, const struct view *view, const double 
 		ret_change[a] *= 180 / PI;
 }
 
+/* FNV-1a (Fowler, Noll and Vo), of 64 bits. */
+static uint64_t hash(uint64_t before, const void *data, size_t size)
+{
+	const unsigned char *bytes = data;
+
+	for (size_t i = 0; i < size; i++)
+		before = (before ^ bytes[i]) * 1099511628211u;
+	return before;
+}
+
+uint64_t refine_basis(const struct reduced *reduced, const struct orbit *orbit, enum refine_kind kind, double mu_water)
+{
+	const struct geometry *geometry = &reduced->geometry;
+	const size_t count = (size_t)geometry->count, bins = (size_t)geometry->columns * (size_t)geometry->rows;
+	uint64_t basis = hash(14695981039346656037u, &kind, sizeof(kind));
+
+	basis = hash(basis, &mu_water, sizeof(mu_water));
+	basis = hash(basis, geometry->views, count * sizeof(*geometry->views));
+	basis = hash(basis, reduced->views, count * sizeof(*reduced->views));
+	basis = hash(basis, reduced->known, count * sizeof(*reduced->known));
+	basis = hash(basis, reduced->projections, count * bins * sizeof(*reduced->projections));
+	return hash(basis, orbit->angle, (size_t)orbit->count * sizeof(*orbit->angle));
+}
+
 /* ---- levels ---- */
 
 /* The last level has the bins that are there, the first one those of twice their size, where they are many enough. */
@@ -384,7 +408,8 @@ int refine_find(const struct reduced *reduced, const struct orbit *orbit, enum r
 		const struct refine_reference *reference, const struct refine_watch *watch,
 		struct refinement *ret_refinement, struct error *err)
 {
-	struct refinement refinement = {.path = open_path(orbit, kind)};
+	struct refinement refinement = {.path = open_path(orbit, kind),
+					.basis = refine_basis(reduced, orbit, kind, mu_water)};
 	const int levels = levels_of(reduced);
 	struct reduced half = {0};
 	struct run run;

@@ -1,6 +1,8 @@
 #ifndef CBCT_CORE_REFINE_H
 #define CBCT_CORE_REFINE_H
 
+#include <stdint.h>
+
 #include "core/backend.h"
 #include "core/refine/path.h"
 #include "core/refine/reduced.h"
@@ -53,8 +55,9 @@ struct refinement {
 	int held_out; /* views, */
 	/* and the root mean square of their detail that is unexplained, without and with the path, kept or not */
 	double held_before, held_after;
-	int better;   /* views among them that are explained better */
-	double alike; /* of a reference's projections the share that the views' detail has, 1: the same; else 0 */
+	int better;     /* views among them that are explained better */
+	double alike;   /* of a reference's projections the share that the views' detail has, 1: the same; else 0 */
+	uint64_t basis; /* refine_basis */
 };
 
 /*
@@ -72,6 +75,11 @@ double refine_place(const struct orbit *orbit, int view);
  */
 void refine_change(enum refine_kind kind, const struct view *view, const double motion[PATH_NUMBERS],
 		   double ret_change[PATH_NUMBERS]);
+/*
+ * A number of all that a refinement is found from but the reference: who has what was found from the same need not look
+ * for it again.
+ */
+uint64_t refine_basis(const struct reduced *reduced, const struct orbit *orbit, enum refine_kind kind, double mu_water);
 /* Bytes of the host's memory that refine_find takes: it works on the CPU's backend. */
 int refine_bytes(const struct reduced *reduced, size_t *ret_bytes, struct error *err);
 /* What it takes, in updates of a voxel by a view as FDK makes them. */

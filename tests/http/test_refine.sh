@@ -167,7 +167,7 @@ test_few_noisy_views_are_refined_with_the_volume_of_another_job() {
 	req GET "/v1/jobs/$job/refinement"
 	expect_json '.reference > 0.7 and .accepted'
 
-	# What was found is kept: a job that goes on from its checkpoint does not look for it again.
+	# What was found is kept: a job that goes on from its checkpoint, or began again without any, does not look for it again.
 	local reference=$state/jobs/$good/final.nii found
 	[ -e "$reference" ] || fail "the reference's voxels: $(ls "$state/jobs/$good"/*)"
 	req POST /v1/jobs -H 'Content-Type: application/json' -d "{\"scan\": \"$scan\", $grid, \"fdk\": {}, \"sart\": {\"iterations\": 300},
@@ -178,6 +178,11 @@ test_few_noisy_views_are_refined_with_the_volume_of_another_job() {
 	req GET "/v1/jobs/$waiting/refinement"
 	found=$(jq -cS . "$body")
 	mv "$reference" "$work/"
+	kill -9 "$(worker_of)"
+	until req GET "/v1/jobs/$waiting" && jq -e '.attempts == 2 and .iteration >= 2' "$body" >/dev/null; do
+		[ "$(json .state)" != failed ] || fail "a job that had refined its geometry: $(json .error)"
+		sleep 0.02
+	done
 	post_job "$recipe"'"fdk": {}, "priority": "stat"}'
 	wait_job succeeded
 	job=$waiting
@@ -189,5 +194,5 @@ test_few_noisy_views_are_refined_with_the_volume_of_another_job() {
 	expect_status 204
 }
 
-start_daemon
+start_daemon --checkpoint-seconds 3600
 run_tests

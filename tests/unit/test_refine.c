@@ -502,6 +502,86 @@ START_TEST(any_number_of_threads_finds_the_same)
 }
 END_TEST
 
+/* ---- in a job ---- */
+
+/* Asks how often it was asked, and says yes from one time on. */
+struct asked {
+	int yields, cancels; /* 0: never */
+	int times;
+};
+
+static bool asked_yield(void *context)
+{
+	struct asked *asked = context;
+
+	return asked->yields > 0 && asked->times >= asked->yields;
+}
+
+static bool asked_cancel(void *context)
+{
+	struct asked *asked = context;
+
+	return ++asked->times >= asked->cancels && asked->cancels > 0;
+}
+
+/* A job that has all its views; those of a head, `more` times as dense. */
+static struct recon *open_job(const struct geometry *geometry, float more, const struct recon_hooks *hooks,
+			      struct device *device)
+{
+	static float projections[VIEWS * COLUMNS * ROWS];
+	static int views[VIEWS];
+	const struct linearise linearise = {.sample = SAMPLE_FLOAT32, .quantity = QUANTITY_LINE_INTEGRAL};
+	struct recipe recipe =
+	    recipe_on(&(struct grid){.size = {20, 20, 16}, .spacing = {8, 8, 8}, .origin = {-76, -76, -60}});
+	struct recon *recon = NULL;
+	struct error err;
+
+	recipe.fdk.on = recipe.refine.geometry = true;
+	take(geometry, 0, projections);
+	for (int i = 0; i < VIEWS * COLUMNS * ROWS; i++)
+		projections[i] *= more;
+	for (int k = 0; k < VIEWS; k++)
+		views[k] = k;
+	ck_assert_msg(recon_open(&backend_cpu, device, geometry, &linearise, &recipe, hooks, &recon, &err) == 0, "%s",
+		      err.text);
+	ck_assert_msg(recon_push(recon, projections, views, VIEWS, &err) == 0, "%s", err.text);
+	recipe_clear(&recipe);
+	return recon;
+}
+
+/* It is asked between its steps whether it goes on. What it goes by is the same again, and not that of other views. */
+START_TEST(a_refinement_makes_room)
+{
+	const struct arm arm = {
+	    .columns = COLUMNS, .rows = ROWS, .count = VIEWS, .pixel = PIXEL, .first = .2, .step = 3.5 / (VIEWS - 1)};
+	struct geometry geometry, moved = {.count = 0};
+	struct refinement refinement = {.held_out = -1};
+	uint64_t basis[3];
+	struct device *device;
+	struct error err;
+
+	ck_assert_int_eq(arm_nominal_geometry(&arm, &geometry, &err), 0);
+	ck_assert_int_eq(backend_cpu.open(0, &(struct device_options){.threads = 2}, &device, &err), 0);
+	for (int i = 0; i < 3; i++) {
+		struct asked asked = {.cancels = i == 0 ? 100000 : 0};
+		const struct recon_hooks hooks = {.context = &asked, .cancelled = asked_cancel, .yield = asked_yield};
+		struct recon *recon = open_job(&geometry, i == 2 ? 1.01f : 1, &hooks, device);
+
+		basis[i] = recon_refine_basis(recon);
+		asked = (struct asked){.yields = i == 0 ? 20 : 0, .cancels = i == 0 ? 0 : 20};
+		ck_assert_int_eq(recon_refine(recon, NULL, &refinement, &moved, &err),
+				 i == 0 ? ERR_BUSY : ERR_CANCELLED);
+		ck_assert_int_eq(asked.times, 20);
+		ck_assert_int_eq(recon_iteration(recon), 0);
+		ck_assert_int_eq(refinement.held_out, -1);
+		recon_free(recon);
+	}
+	ck_assert(basis[0] == basis[1] && basis[0] != basis[2] && basis[0] != 0);
+	backend_cpu.close(device);
+	geometry_clear(&geometry);
+}
+END_TEST
+
 Suite *refine_suite(void);
 Suite *refine_suite(void)
 {
@@ -522,6 +602,7 @@ Suite *refine_suite(void)
 	tcase_add_loop_test(scans, few_noisy_views_are_registered_with_a_reference, 0, 2);
 	tcase_add_test(scans, a_reference_of_something_else_is_not_followed);
 	tcase_add_test(scans, any_number_of_threads_finds_the_same);
+	tcase_add_test(scans, a_refinement_makes_room);
 	suite_add_tcase(suite, scans);
 	return suite;
 }
