@@ -9,7 +9,7 @@
 
 extern const struct correction correction_lag, correction_scatter, correction_flat_dark, correction_air_region,
     correction_hardening, correction_defects, correction_samples, correction_truncation, correction_exterior,
-    correction_blank_views, correction_metal, correction_averaging, correction_agreement;
+    correction_blank_views, correction_metal, correction_dense, correction_averaging, correction_agreement;
 
 /*
  * In the order in which they run. The detector's lag is of all that it has counted, scatter too. Defects of the map are
@@ -18,9 +18,9 @@ extern const struct correction correction_lag, correction_scatter, correction_fl
  * averaged when the rays that are left out are known. The check of the geometry changes nothing.
  */
 const struct correction *const corrections[CORRECTION_COUNT] = {
-    &correction_lag,       &correction_scatter,   &correction_flat_dark,  &correction_defects,  &correction_air_region,
-    &correction_hardening, &correction_samples,   &correction_truncation, &correction_exterior, &correction_blank_views,
-    &correction_metal,     &correction_averaging, &correction_agreement,
+    &correction_lag,       &correction_scatter, &correction_flat_dark,  &correction_defects,   &correction_air_region,
+    &correction_hardening, &correction_samples, &correction_truncation, &correction_exterior,  &correction_blank_views,
+    &correction_metal,     &correction_dense,   &correction_averaging,  &correction_agreement,
 };
 
 static bool is_wanted(const struct correction *row, const struct recipe *recipe, const struct linearise *linearise)

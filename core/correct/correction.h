@@ -56,6 +56,7 @@ struct correction_job {
 	int (*wide)(void *context, struct error *err);
 	void *wide_context;
 	bool averages;                     /* recipe_averages: iterations get means over pixels (averaging.h) */
+	bool subsets;                      /* iterations are SART's */
 	struct recon_agreement *agreement; /* what the check of the geometry finds goes there */
 	double *settled;                   /* iterations after which relaxation falls (averaging.h); INFINITY: never */
 	const struct warning_sink *warnings;
@@ -84,7 +85,7 @@ struct correction_ask {
 	const struct geometry *geometry;
 	const struct orbit *orbit;
 	const struct recipe *recipe;
-	bool averages; /* as in struct correction_job */
+	bool averages, subsets; /* as in struct correction_job */
 };
 
 /* Voxels in some slices of a volume that is kept. */
@@ -146,7 +147,7 @@ struct correction {
 	int (*resume)(const struct correction_job *job, void *state, const void *bytes, size_t size, struct error *err);
 };
 
-enum { CORRECTION_COUNT = 13 };
+enum { CORRECTION_COUNT = 14 };
 extern const struct correction *const corrections[CORRECTION_COUNT];
 
 /* The corrections of one reconstruction. */

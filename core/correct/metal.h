@@ -5,7 +5,7 @@
 
 #include "core/fdk.h"
 
-/* The metal stage of core/recon/recon.c, and nobody else's: see metal.c. */
+/* The metal stage of core/recon/recon.c: see metal.c. Its list and its traces serve dense.c, too. */
 
 /*
  * A voxel of metal, or of its rim: what lies so near and is so bright that it is the metal's blur, which goes with the
@@ -54,6 +54,10 @@ struct metal_tools {
 	int blanks;
 	const struct cancel *cancel;
 };
+
+struct correction_job;
+/* Of a job with the slots of metal_slots to work in. */
+struct metal_tools metal_tools_of(const struct correction_job *job);
 
 /* Views that are projected in one go. */
 static inline int metal_slots(const struct geometry *geometry)

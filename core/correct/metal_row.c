@@ -35,7 +35,7 @@ static void close_metal(void *state)
 	free(state);
 }
 
-static struct metal_tools tools_of(const struct correction_job *job)
+struct metal_tools metal_tools_of(const struct correction_job *job)
 {
 	return (struct metal_tools){
 	    .backend = job->backend,
@@ -136,7 +136,7 @@ static int take_view(const struct correction_job *job, void *state, const struct
 /* Metal's shadows out of the projections, and of the FDK of those and the one before what is better at each place. */
 static int replace(const struct correction_job *job, struct metal *metal, bool *ret_changed, struct error *err)
 {
-	const struct metal_tools tools = tools_of(job);
+	const struct metal_tools tools = metal_tools_of(job);
 	struct metal_doubt doubt = {0};
 	int code = metal_find_traces(metal, &tools, err);
 
@@ -177,7 +177,7 @@ static void warn_of_metal(const struct correction_job *job, const struct metal *
 /* The metal of the FDK volume out of the projections, and the FDK of those. */
 static int take_out(const struct correction_job *job, struct metal *metal, bool *ret_changed, struct error *err)
 {
-	const struct metal_tools tools = tools_of(job);
+	const struct metal_tools tools = metal_tools_of(job);
 	const double threshold = job->recipe->mu_water * (1 + job->recipe->metal.threshold_hu / 1000);
 	int code = metal_find(metal, &tools, job->volume, threshold, err);
 
@@ -191,7 +191,7 @@ static int take_out(const struct correction_job *job, struct metal *metal, bool 
 /* In a resumed run: the projections become what they were. */
 static int take_out_again(const struct correction_job *job, struct metal *metal, struct error *err)
 {
-	const struct metal_tools tools = tools_of(job);
+	const struct metal_tools tools = metal_tools_of(job);
 	int code;
 
 	if (metal->voxels_count == 0)
@@ -203,7 +203,7 @@ static int take_out_again(const struct correction_job *job, struct metal *metal,
 static int apply(const struct correction_job *job, void *state, enum correction_time time, bool *ret_changed,
 		 struct error *err)
 {
-	const struct metal_tools tools = tools_of(job);
+	const struct metal_tools tools = metal_tools_of(job);
 	struct metal *metal = state;
 
 	if (time == CORRECT_AFTER_FDK)
@@ -217,7 +217,7 @@ static int apply(const struct correction_job *job, void *state, enum correction_
 
 static int show(const struct correction_job *job, void *state, double *ret_estimate_mm, struct error *err)
 {
-	const struct metal_tools tools = tools_of(job);
+	const struct metal_tools tools = metal_tools_of(job);
 	struct metal *metal = state;
 
 	if (metal->voxels_count == 0)
@@ -228,7 +228,7 @@ static int show(const struct correction_job *job, void *state, double *ret_estim
 
 static int hide(const struct correction_job *job, void *state, struct error *err)
 {
-	const struct metal_tools tools = tools_of(job);
+	const struct metal_tools tools = metal_tools_of(job);
 	struct metal *metal = state;
 
 	return metal->voxels_count == 0 ? 0 : metal_hide(metal, &tools, job->volume, err);

@@ -198,7 +198,8 @@ static int memory_on(const struct backend *backend, struct device *device, struc
 					   .geometry = recon->geometry,
 					   .orbit = &recon->orbit,
 					   .recipe = recipe,
-					   .averages = recipe_averages(recipe, &recon->orbit)};
+					   .averages = recipe_averages(recipe, &recon->orbit),
+					   .subsets = has_subsets(recipe)};
 	size_t kept = kept_bytes(recon);
 	struct walk beside = {.backend = backend, .device = device, .measures = true}, planned = beside;
 	struct correction_bytes around = {0};

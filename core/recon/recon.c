@@ -117,6 +117,7 @@ static int open_corrections(struct recon *recon, struct error *err)
 	    .wide = begin_rim,
 	    .wide_context = recon,
 	    .averages = recipe_averages(&recon->recipe, &recon->orbit),
+	    .subsets = has_subsets(&recon->recipe),
 	    .agreement = &recon->agreement,
 	    .settled = &recon->settled,
 	    .warnings = &recon->warnings,

@@ -1007,23 +1007,39 @@ START_TEST(a_run_that_yields_goes_on_to_the_same_bits)
 }
 END_TEST
 
-/* The rim of the field of view is in its checkpoints, and what begins anew has none yet. */
-START_TEST(a_body_wider_than_the_detector_goes_on_from_its_checkpoint)
+static void assert_goes_on(const struct phantom *phantom, const char *warning)
 {
 	static const char request[] = "{\"scan\":\"s\",\"grid\":{\"size\":[24,20,12],\"spacing_mm\":[4,5,6]},"
 				      "\"fdk\":{},\"sart\":{\"iterations\":4,\"subsets\":3},\"emit\":[2,4]}";
-	struct ellipsoid body = {SHAPE_CYLINDER, {60, 60, 200}, {0, 0, 0}, 0, 0.02};
 	struct watched whole = {0}, first = {.yield_at = 2}, second = {0};
 	struct error err = {0};
 	char checkpoint[200];
 
-	put_scan_of(&(struct phantom){1, &body});
+	put_scan_of(phantom);
 	snprintf(checkpoint, sizeof(checkpoint), "%s/%s", out, CHECKPOINT_FILE);
 	ck_assert_int_eq(run(request, out, NULL, 0, &whole, &err), 0);
-	ck_assert_ptr_nonnull(strstr(whole.warnings, "truncated"));
+	ck_assert_ptr_nonnull(strstr(whole.warnings, warning));
 	ck_assert_int_eq(run(request, out, NULL, 0, &first, &err), ERR_BUSY);
 	ck_assert_msg(run(request, out, checkpoint, 2, &second, &err) == 0, "%s", err.text);
 	ck_assert_mem_eq(second.sha256[second.kept - 1], whole.sha256[whole.kept - 1], 32);
+}
+
+/* The rim of the field of view is in its checkpoints, and what begins anew has none yet. */
+START_TEST(a_body_wider_than_the_detector_goes_on_from_its_checkpoint)
+{
+	struct ellipsoid body = {SHAPE_CYLINDER, {60, 60, 200}, {0, 0, 0}, 0, 0.02};
+
+	assert_goes_on(&(struct phantom){1, &body}, "truncated");
+}
+END_TEST
+
+/* Which rays are left out is known from what the FDK volume had, which a run that goes on has no more. */
+START_TEST(a_body_with_a_rod_goes_on_from_its_checkpoint)
+{
+	struct ellipsoid parts[] = {{SHAPE_CYLINDER, {60, 60, 200}, {0, 0, 0}, 0, 0.02},
+				    {SHAPE_CYLINDER, {4, 4, 200}, {20, 10, 0}, 0, 0.3}};
+
+	assert_goes_on(&(struct phantom){2, parts}, "rays_left_out");
 }
 END_TEST
 
@@ -1174,6 +1190,7 @@ Suite *scan_directory_suite(void)
 	tcase_add_test(pipelines, a_scan_of_what_is_there_is_as_if_no_more_had_been_planned);
 	tcase_add_test(pipelines, a_run_that_yields_goes_on_to_the_same_bits);
 	tcase_add_test(pipelines, a_body_wider_than_the_detector_goes_on_from_its_checkpoint);
+	tcase_add_test(pipelines, a_body_with_a_rod_goes_on_from_its_checkpoint);
 	tcase_add_test(pipelines, a_checkpoint_that_is_newer_brings_its_history_and_serves_where_no_volume_is_missing);
 	tcase_add_test(pipelines, a_checkpoint_of_something_else_is_refused);
 	tcase_add_test(pipelines, a_run_that_is_stopped_leaves_nothing_half_written);

@@ -1,0 +1,195 @@
+/*
+ * Rays through what is very dense are left out of SART: a screw, a rod, a plate in the grid, where metal is not asked
+ * for.
+ *
+ * Voxels make a blur of its edges. What is left of p - A v along a ray beside it is large, and an iteration spreads
+ * that over all of the ray: streaks, more with each iteration, where FDK's window has fewer. Without these rays what is
+ * dense stays as FDK has it, and the others mend its streaks. tests/bench/results/dense.txt has the figures and what
+ * else was tried.
+ *
+ * Dense are voxels of DENSE times water's attenuation or more, in the volume that the iterations begin with, and what
+ * belongs to the same object (metal_find). The list of them is what a run that goes on gets.
+ */
+#include <stdlib.h>
+
+#include "core/correct/correction.h"
+#include "core/correct/metal.h"
+
+/* Times water's attenuation; cortical bone has up to 2.2. */
+static const double DENSE = 2.9;
+/*
+ * An object that is dense itself, with more than this share of dense voxels among those of half of water and more,
+ * keeps its rays: without them iterations would be left with nothing.
+ */
+static const double FEW = 0.1, OBJECT = 0.5;
+enum { SLOTS = 4 }; /* that views are projected in */
+
+static bool wanted(const struct recipe *recipe, const struct linearise *linearise)
+{
+	(void)linearise;
+	return recipe->fdk.on && !recipe->metal.on && recipe->algorithm != NULL;
+}
+
+static int slots_of(const struct geometry *geometry)
+{
+	return geometry->count < SLOTS ? geometry->count : SLOTS;
+}
+
+static int bytes_of(const struct correction_ask *ask, struct correction_bytes *bytes, struct error *err)
+{
+	const struct geometry *geometry = ask->geometry;
+	const int slots = slots_of(geometry);
+
+	(void)err;
+	if (!ask->subsets)
+		return 0;
+	bytes->device += ask->backend->stack_bytes(ask->device, geometry->columns, geometry->rows, slots);
+	bytes->host += (size_t)slots * (size_t)geometry->columns * (size_t)geometry->rows * sizeof(float);
+	return 0;
+}
+
+static int open_dense(const struct correction_job *job, void **ret_state, struct error *err)
+{
+	(void)job;
+	*ret_state = calloc(1, sizeof(struct metal));
+	return *ret_state != NULL ? 0 : error_set(err, ERR_NO_MEMORY, "no memory for a list of dense voxels");
+}
+
+static void close_dense(void *state)
+{
+	if (state != NULL)
+		metal_clear(state);
+	free(state);
+}
+
+static int find_traces(const struct correction_job *job, struct metal *dense, struct error *err)
+{
+	const struct geometry *geometry = job->geometry;
+	struct metal_tools tools = metal_tools_of(job);
+	int code;
+
+	if (dense->voxels_count == 0)
+		return 0;
+	tools.slots = slots_of(geometry);
+	tools.batch = NULL;
+	code = job->backend->stack_new(job->device, geometry->columns, geometry->rows, tools.slots, &tools.batch, err);
+	if (code == 0)
+		code = metal_find_traces(dense, &tools, err);
+	job->backend->stack_free(tools.batch);
+	return code;
+}
+
+/* Without any voxel of at least `least` the volume need not come to the host. */
+static int has_any(const struct correction_job *job, double least, bool *ret_any, struct error *err)
+{
+	const struct backend *backend = job->backend;
+	double above = 0;
+	int code = backend->volume_fill(job->work, (float)least, err);
+
+	if (code == 0)
+		code = backend->volume_axpby(1, job->volume, -1, job->work, err);
+	if (code == 0)
+		code = backend->volume_maximum(0, job->work, job->work, err);
+	if (code == 0)
+		code = backend->volume_dot(job->plan, job->work, job->work, &above, err);
+	if (code == 0)
+		*ret_any = above > 0;
+	return code;
+}
+
+/* True where dense voxels are few beside those of the object. */
+static int are_few(const struct correction_job *job, double least, bool *ret_few, struct error *err)
+{
+	const struct grid *grid = &job->recipe->grid;
+	const size_t slice = (size_t)grid->size[0] * (size_t)grid->size[1];
+	const float body = (float)(OBJECT * job->recipe->mu_water), dense = (float)least;
+	float *values = malloc(slice * sizeof(*values));
+	size_t object = 0, found = 0;
+	int code = values != NULL ? 0 : error_set(err, ERR_NO_MEMORY, "no memory for a slice of %zu voxels", slice);
+
+	for (int z = 0; z < grid->size[2] && code == 0; z++) {
+		code = job->backend->volume_download(job->volume, z, 1, values, err);
+		for (size_t i = 0; i < slice && code == 0; i++) {
+			object += values[i] >= body;
+			found += values[i] >= dense;
+		}
+	}
+	free(values);
+	if (code == 0)
+		*ret_few = (double)found <= FEW * (double)object;
+	return code;
+}
+
+static int find(const struct correction_job *job, struct metal *dense, struct error *err)
+{
+	const struct metal_tools tools = metal_tools_of(job);
+	const double least = DENSE * job->recipe->mu_water;
+	bool does = false;
+	int code = has_any(job, least, &does, err);
+
+	if (code == 0 && does)
+		code = are_few(job, least, &does, err);
+	return code == 0 && does ? metal_find(dense, &tools, job->volume, least, err) : code;
+}
+
+static int leave_out(const struct correction_job *job, struct metal *dense, struct error *err)
+{
+	const struct geometry *geometry = job->geometry;
+	const double rays = (double)geometry->count * (double)geometry->columns * (double)geometry->rows;
+	struct metal_tools tools = metal_tools_of(job);
+
+	if (dense->traces_count == 0)
+		return 0;
+	tools.slots = slots_of(geometry);
+	if (*job->iteration == 0)
+		warning_tell(job->warnings, "rays_left_out",
+			     "%zu voxels have at least %g HU or belong to such: iterations leave out the %.3g %% of "
+			     "the rays that pass them",
+			     dense->found, 1000 * (DENSE - 1), 100 * (double)dense->replaced / rays);
+	return metal_leave_out(dense, &tools, err);
+}
+
+/* Least squares ask for all rays; only SART's steps keep what no ray passes. */
+static int apply(const struct correction_job *job, void *state, enum correction_time time, bool *ret_changed,
+		 struct error *err)
+{
+	int code = 0;
+
+	(void)time;
+	(void)ret_changed;
+	if (!job->subsets)
+		return 0;
+	if (*job->iteration == 0)
+		code = find(job, state, err);
+	if (code == 0)
+		code = find_traces(job, state, err);
+	return code == 0 ? leave_out(job, state, err) : code;
+}
+
+static const void *found(const void *state, size_t *ret_bytes)
+{
+	const struct metal *dense = state;
+
+	*ret_bytes = dense->voxels_count * sizeof(*dense->voxels);
+	return dense->voxels;
+}
+
+static int resume(const struct correction_job *job, void *state, const void *bytes, size_t size, struct error *err)
+{
+	return metal_put(state, &job->recipe->grid, bytes, size, err);
+}
+
+extern const struct correction correction_dense;
+const struct correction correction_dense = {
+    .name = "dense",
+    .summary = "rays through what is very dense are left out of the iterations, where metal is not taken out",
+    .times = 1U << CORRECT_BEFORE_ITERATING,
+    .needs = NEEDS_WHOLE_IMAGES | NEEDS_ALL_VIEWS | NEEDS_VOLUME,
+    .wanted = wanted,
+    .bytes = bytes_of,
+    .open = open_dense,
+    .close = close_dense,
+    .apply = apply,
+    .found = found,
+    .resume = resume,
+};
