@@ -116,7 +116,7 @@ test_conjugate_gradients_in_place_of_sart() {
 	req POST /v1/jobs -H 'Content-Type: application/json' -d "{\"scan\": \"$scan\", \"sart\": {}, \"cgls\": {}}"
 	expect_problem 422 /cgls
 
-	local recipe="$small"'"cgls": {"iterations": 300}}' undisturbed preempted
+	local recipe="$small"'"cgls": {"iterations": 130}}' undisturbed preempted
 	post_job "$recipe"
 	wait_job succeeded
 	req GET "/v1/jobs/$job/volumes"
