@@ -78,8 +78,11 @@ struct recon {
  * progress bar only.
  */
 static const double WORK_LOAD = 0.2, WORK_FDK = 1, WORK_TV = 0.2;
-/* How much faster a device is than the processor, which refines. */
-static const double WORK_DEVICE = 30;
+/*
+ * What a refinement takes on a device with memory of its own, as many times as on the processor beside an FDK there:
+ * its volumes are small, and the processor has a part in each step. .7 s on an H200, 73e9 updates a second.
+ */
+static const double WORK_DEVICE = 5;
 
 static inline double iteration_work(const struct recipe *recipe)
 {

@@ -200,6 +200,8 @@ static int memory_on(const struct backend *backend, struct device *device, struc
 					   .recipe = recipe,
 					   .averages = recipe_averages(recipe, &recon->orbit),
 					   .subsets = has_subsets(recipe)};
+	const struct refine_device on = {backend, device};
+	struct refine_bytes refining = {0};
 	size_t kept = kept_bytes(recon);
 	struct walk beside = {.backend = backend, .device = device, .measures = true}, planned = beside;
 	struct correction_bytes around = {0};
@@ -209,11 +211,13 @@ static int memory_on(const struct backend *backend, struct device *device, struc
 	int code = corrections_bytes(&ask, &recon->input.linearise, &around, err);
 
 	if (code == 0)
-		code = refining_bytes(recipe, recon->geometry, &recon->orbit, &kept, err);
+		code = refining_bytes(recipe, recon->geometry, &recon->orbit, &on, &refining, err);
 	if (code == 0)
 		code = walk_beside(recon, &beside, err);
 	if (code == 0)
 		code = walk_planned(recon, &planned, err);
+	kept += refining.aside;
+	around.device += refining.device;
 	options->beside = around.device + beside.projections + beside.volumes + beside.scratch;
 	options->lends = around.borrowed;
 	if (code == 0)
@@ -224,7 +228,7 @@ static int memory_on(const struct backend *backend, struct device *device, struc
 	memory.scratch = bytes.scratch + bytes.raw + beside.scratch;
 	if (backend == &backend_outofcore) {
 		/* The device holds slabs of one volume at a time, or a correction's; the host has all the rest. */
-		memory.host = bytes.host + beside.host + around.host + around.aside + kept;
+		memory.host = bytes.host + beside.host + around.host + around.aside + refining.host + kept;
 		if (around.device > memory.volumes + memory.scratch)
 			memory.scratch = around.device - memory.volumes;
 	} else {

@@ -177,7 +177,7 @@ static int open_refining(struct recon *recon, struct error *err)
 	if (code == 0)
 		code = refining_work(recon->refining, &recon->recipe.grid, recon->geometry->count, &recon->refine_work,
 				     err);
-	if (recon->backend != &backend_cpu)
+	if (recon->backend->own_memory)
 		recon->refine_work *= WORK_DEVICE;
 	recon->work_total += recon->refine_work;
 	return code;
@@ -384,6 +384,7 @@ int recon_refine(struct recon *recon, const struct refine_reference *reference, 
 	struct asking asking = {.recon = recon};
 	const struct cancel leave = {must_leave, &asking};
 	const struct refine_watch watch = {&leave, tell_refining, recon};
+	const struct refine_device on = {recon->backend, recon->device};
 	const struct input *input = &recon->input;
 	struct refinement refinement = {.held_out = 0};
 	int code = 0;
@@ -394,8 +395,8 @@ int recon_refine(struct recon *recon, const struct refine_reference *reference, 
 	recon->refine_from = recon->work_done;
 	refining_leave_out(recon->refining, input->blank, input->counts.blank);
 	if (recon->refining != NULL)
-		code =
-		    refining_find(recon->refining, &recon->recipe, &recon->orbit, reference, &watch, &refinement, err);
+		code = refining_find(recon->refining, &recon->recipe, &recon->orbit, &on, reference, &watch,
+				     &refinement, err);
 	if (code == ERR_CANCELLED && asking.yields)
 		code = error_set(err, ERR_BUSY, "yielded while the geometry was refined");
 	recon->work_done = recon->refine_from;

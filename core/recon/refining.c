@@ -50,22 +50,25 @@ void refining_free(struct refining *refining)
 }
 
 int refining_bytes(const struct recipe *recipe, const struct geometry *geometry, const struct orbit *orbit,
-		   size_t *bytes, struct error *err)
+		   const struct refine_device *on, struct refine_bytes *ret_bytes, struct error *err)
 {
+	struct refine_bytes bytes = {0};
 	struct reduced reduced;
-	size_t working = 0;
 	int code;
 
+	*ret_bytes = bytes;
 	if (!is_wanted(recipe, geometry, orbit))
 		return 0;
 	code = reduced_open(&reduced, geometry, orbit, REFINE_VIEWS_MOST, REFINE_BINS_MOST, err);
 	if (code < 0)
 		return code;
-	code = refine_bytes(&reduced, &working, err);
+	code = refine_bytes(&reduced, on, &bytes, err);
 	if (recipe->refine.reference[0] != '\0')
-		working += REFERENCE_BYTES;
-	*bytes += working + reduced_bytes(geometry, REFINE_VIEWS_MOST, REFINE_BINS_MOST) +
-		  (size_t)geometry->columns * (size_t)geometry->rows * sizeof(float);
+		bytes.aside += REFERENCE_BYTES;
+	bytes.aside += reduced_bytes(geometry, REFINE_VIEWS_MOST, REFINE_BINS_MOST) +
+		       (size_t)geometry->columns * (size_t)geometry->rows * sizeof(float);
+	if (code == 0)
+		*ret_bytes = bytes;
 	reduced_clear(&reduced);
 	return code;
 }
@@ -95,10 +98,10 @@ uint64_t refining_basis(const struct refining *refining, const struct recipe *re
 }
 
 int refining_find(const struct refining *refining, const struct recipe *recipe, const struct orbit *orbit,
-		  const struct refine_reference *reference, const struct refine_watch *watch,
-		  struct refinement *ret_refinement, struct error *err)
+		  const struct refine_device *on, const struct refine_reference *reference,
+		  const struct refine_watch *watch, struct refinement *ret_refinement, struct error *err)
 {
-	return refine_find(&refining->reduced, orbit, refining->kind, recipe->mu_water, reference, watch,
+	return refine_find(&refining->reduced, orbit, refining->kind, recipe->mu_water, on, reference, watch,
 			   ret_refinement, err);
 }
 

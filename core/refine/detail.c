@@ -3,18 +3,48 @@
 
 #include <math.h>
 #include <stddef.h>
+#include <string.h>
 
-static void smooth_along(const float *from, size_t step, int count, const float *kernel, int reach, float *to)
+/* Adds `weight` times `count` values to sums. */
+static void add_weighted(const float *from, int count, float weight, float *sums)
 {
-	for (int i = 0; i < count; i++) {
-		float sum = 0;
+#pragma omp simd
+	for (int i = 0; i < count; i++)
+		sums[i] += weight * from[i];
+}
 
+/*
+ * Lines of `count` values, `apart` from one to the next, each smoothed across the lines: every value is a sum in the
+ * order of the kernel. A line beyond the first or the last one is that one.
+ */
+static void smooth_across(const float *from, int count, int lines, size_t apart, const float *kernel, int reach,
+			  float *to)
+{
+	for (int line = 0; line < lines; line++) {
+		float *sums = to + (size_t)line * apart;
+
+		memset(sums, 0, (size_t)count * sizeof(*sums));
 		for (int k = -reach; k <= reach; k++) {
-			const int at = i + k < 0 ? 0 : i + k >= count ? count - 1 : i + k;
+			const int at = line + k < 0 ? 0 : line + k >= lines ? lines - 1 : line + k;
 
-			sum += kernel[k + reach] * from[(size_t)at * step];
+			add_weighted(from + (size_t)at * apart, count, kernel[k + reach], sums);
 		}
-		to[(size_t)i * step] = sum;
+	}
+}
+
+/* A line smoothed along itself, the same way. */
+static void smooth_along(const float *from, int count, const float *kernel, int reach, float *to)
+{
+	memset(to, 0, (size_t)count * sizeof(*to));
+	for (int k = -reach; k <= reach; k++) {
+		const int first = k < 0 ? -k : 0, end = k > 0 ? count - k : count;
+
+		for (int i = 0; i < (first < count ? first : count); i++)
+			to[i] += kernel[k + reach] * from[0];
+		if (first < end)
+			add_weighted(from + first + k, end - first, kernel[k + reach], to + first);
+		for (int i = end > 0 ? end : 0; i < count; i++)
+			to[i] += kernel[k + reach] * from[count - 1];
 	}
 }
 
@@ -28,10 +58,9 @@ void image_smooth(const float *from, int columns, int rows, double sigma, float 
 	for (int i = 0; i <= 2 * reach; i++)
 		kernel[i] /= sum;
 	for (int r = 0; r < rows; r++)
-		smooth_along(from + (size_t)r * (size_t)columns, 1, columns, kernel, reach,
+		smooth_along(from + (size_t)r * (size_t)columns, columns, kernel, reach,
 			     work + (size_t)r * (size_t)columns);
-	for (int c = 0; c < columns; c++)
-		smooth_along(work + c, (size_t)columns, rows, kernel, reach, ret_to + c);
+	smooth_across(work, columns, rows, (size_t)columns, kernel, reach, ret_to);
 }
 
 void image_detail(const float *from, int columns, int rows, double fine, double coarse, float *work, float *ret_to)

@@ -150,19 +150,19 @@ static int work_of(const struct schedule *schedule, bool is_referred)
 	return (is_referred ? 0 : 2 * (schedule->warm + steps) * ITERATION_WORK) + steps * STEP_WORK;
 }
 
-int refine_bytes(const struct reduced *reduced, size_t *ret_bytes, struct error *err)
+int refine_bytes(const struct reduced *reduced, const struct refine_device *on, struct refine_bytes *ret_bytes,
+		 struct error *err)
 {
+	struct refine_bytes bytes = {0};
 	struct reduced half = {0};
-	size_t bytes = 0;
 	int code = reduced_halve(reduced, &half, err);
 
 	for (int level = 0; level < levels_of(reduced) && code == 0; level++) {
 		struct registration_options options = options_of(reduced, &half, level, REFINE_GEOMETRY, false);
-		size_t more = 0;
 
+		options.on = on;
 		options.empty = options.wide = true;
-		code = registration_bytes(&options, &more, err);
-		bytes += more;
+		code = registration_add_bytes(&options, &bytes, err);
 	}
 	if (code == 0)
 		*ret_bytes = bytes;
@@ -405,8 +405,8 @@ static struct path open_path(const struct orbit *orbit, enum refine_kind kind)
 }
 
 int refine_find(const struct reduced *reduced, const struct orbit *orbit, enum refine_kind kind, double mu_water,
-		const struct refine_reference *reference, const struct refine_watch *watch,
-		struct refinement *ret_refinement, struct error *err)
+		const struct refine_device *on, const struct refine_reference *reference,
+		const struct refine_watch *watch, struct refinement *ret_refinement, struct error *err)
 {
 	struct refinement refinement = {.path = open_path(orbit, kind),
 					.basis = refine_basis(reduced, orbit, kind, mu_water)};
@@ -418,6 +418,7 @@ int refine_find(const struct reduced *reduced, const struct orbit *orbit, enum r
 	for (int level = 0; level < levels && code == 0; level++) {
 		struct registration_options options = options_of(reduced, &half, level, kind, reference != NULL);
 
+		options.on = on;
 		options.orbit = orbit;
 		options.mu_water = mu_water;
 		options.watch = watch;

@@ -80,8 +80,20 @@ void refine_change(enum refine_kind kind, const struct view *view, const double 
  * for it again.
  */
 uint64_t refine_basis(const struct reduced *reduced, const struct orbit *orbit, enum refine_kind kind, double mu_water);
-/* Bytes of the host's memory that refine_find takes: it works on the CPU's backend. */
-int refine_bytes(const struct reduced *reduced, size_t *ret_bytes, struct error *err);
+/* Where the volumes and their projections are computed. Borrowed; `device` NULL: before it is open, for refine_bytes.
+ */
+struct refine_device {
+	const struct backend *backend;
+	struct device *device;
+};
+/* Memory that refine_find takes. */
+struct refine_bytes {
+	size_t device; /* the backend's device's */
+	size_t host;   /* out of core (core/outofcore/outofcore.h): the host's, too */
+	size_t aside;  /* the host's whatever the device is */
+};
+int refine_bytes(const struct reduced *reduced, const struct refine_device *on, struct refine_bytes *ret_bytes,
+		 struct error *err);
 /* What it takes, in updates of a voxel by a view as FDK makes them. */
 int refine_work(const struct reduced *reduced, enum refine_kind kind, bool is_referred, double *ret_updates,
 		struct error *err);
@@ -92,9 +104,12 @@ struct refine_watch {
 	void (*progress)(void *context, double share); /* behind each step: the share of all of them that is done */
 	void *context;
 };
-/* orbit: of the scan. mu_water in 1/mm. reference: NULL for none. The same bits for any number of threads. */
+/*
+ * orbit: of the scan. mu_water in 1/mm. reference: NULL for none. On one backend the same bits for any number of
+ * threads; what CUDA and the CPU find of a view is less than .001 mm apart (tests/gpu/end_to_end.sh).
+ */
 int refine_find(const struct reduced *reduced, const struct orbit *orbit, enum refine_kind kind, double mu_water,
-		const struct refine_reference *reference, const struct refine_watch *watch,
-		struct refinement *ret_refinement, struct error *err);
+		const struct refine_device *on, const struct refine_reference *reference,
+		const struct refine_watch *watch, struct refinement *ret_refinement, struct error *err);
 
 #endif

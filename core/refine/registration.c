@@ -89,6 +89,7 @@ static struct plan_options plan_options_of(const struct registration *fit)
 				     .linearise = {.sample = SAMPLE_FLOAT32},
 				     .sart = &fit->sart,
 				     .tv = &fit->tv,
+				     .reference_precision = true,
 				     .no_samples = true};
 }
 
@@ -98,6 +99,8 @@ static int describe(struct registration *fit, const struct registration_options 
 	int code;
 
 	*fit = (struct registration){.reduced = reduced,
+				     .backend = options->on == NULL ? NULL : options->on->backend,
+				     .device = options->on == NULL ? NULL : options->on->device,
 				     .kind = options->kind,
 				     .watch = options->watch,
 				     .alike = options->alike,
@@ -117,14 +120,15 @@ static int describe(struct registration *fit, const struct registration_options 
 
 void registration_clear(struct registration *fit)
 {
-	const struct backend *backend = &backend_cpu;
+	const struct backend *backend = fit->backend;
 
-	backend->volume_free(fit->volume);
-	backend->volume_free(fit->work);
-	backend->stack_free(fit->measured);
-	backend->stack_free(fit->made);
-	backend->plan_free(fit->plan);
-	backend->close(fit->device);
+	if (backend != NULL) {
+		backend->volume_free(fit->volume);
+		backend->volume_free(fit->work);
+		backend->stack_free(fit->measured);
+		backend->stack_free(fit->made);
+		backend->plan_free(fit->plan);
+	}
 	subsets_clear(&fit->sart.subsets);
 	orbit_clear(&fit->orbit);
 	geometry_clear(&fit->geometry);
@@ -141,26 +145,29 @@ static void count_floats(const struct registration *fit, size_t *ret_voxels, siz
 	*ret_images = ((size_t)IMAGES * (size_t)fit->geometry.count + 4 * (size_t)host_threads()) * pixels_of(fit);
 }
 
-int registration_bytes(const struct registration_options *options, size_t *ret_bytes, struct error *err)
+int registration_add_bytes(const struct registration_options *options, struct refine_bytes *bytes, struct error *err)
 {
-	const struct backend *backend = &backend_cpu;
-	struct plan_bytes bytes = {0};
+	const struct backend *backend = options->on->backend;
+	struct device *device = options->on->device;
+	struct plan_bytes more = {0};
 	struct registration fit;
 	int code = describe(&fit, options, err);
 
 	if (code == 0) {
 		const struct plan_options plan = plan_options_of(&fit);
 
-		code = backend->plan_bytes(NULL, &plan, &bytes, err);
+		code = backend->plan_bytes(device, &plan, &more, err);
 	}
 	if (code == 0) {
+		const int columns = fit.geometry.columns, rows = fit.geometry.rows, count = fit.geometry.count;
 		size_t voxels, images;
 
+		/* Both volumes are the plan's own count: an iterate and its copy. */
+		bytes->device +=
+		    more.volumes + more.scratch + more.raw + 2 * backend->stack_bytes(device, columns, rows, count);
+		bytes->host += more.host + (size_t)count * pixels_of(&fit) * sizeof(float);
 		count_floats(&fit, &voxels, &images);
-		*ret_bytes =
-		    bytes.volumes + bytes.scratch + bytes.raw + (voxels + images) * sizeof(float) +
-		    2 * backend->volume_bytes(NULL, &fit.grid) +
-		    2 * backend->stack_bytes(NULL, fit.geometry.columns, fit.geometry.rows, fit.geometry.count);
+		bytes->aside += (voxels + images) * sizeof(float);
 	}
 	registration_clear(&fit);
 	return code;
@@ -180,7 +187,7 @@ int registration_updates(const struct registration_options *options, double *ret
 static int allocate(struct registration *fit, struct error *err)
 {
 	const struct geometry *geometry = &fit->geometry;
-	const struct backend *backend = &backend_cpu;
+	const struct backend *backend = fit->backend;
 	const size_t count = (size_t)geometry->count;
 	size_t voxels, images;
 	int code;
@@ -195,10 +202,7 @@ static int allocate(struct registration *fit, struct error *err)
 	fit->derived = fit->voxels + voxels / 2;
 	fit->scratch = fit->images + IMAGES * count * pixels_of(fit);
 	fit->held = fit->used + count;
-	code = backend->open(0, &(struct device_options){.threads = host_threads()}, &fit->device, err);
-	if (code == 0)
-		code = backend->stack_new(fit->device, geometry->columns, geometry->rows, geometry->count, &fit->made,
-					  err);
+	code = backend->stack_new(fit->device, geometry->columns, geometry->rows, geometry->count, &fit->made, err);
 	if (code == 0)
 		code = backend->stack_new(fit->device, geometry->columns, geometry->rows, geometry->count,
 					  &fit->measured, err);
@@ -228,7 +232,7 @@ static int share_views_out(struct registration *fit, const struct orbit *orbit, 
 			fit->held[fit->held_count++] = k;
 		if (mine->used)
 			fit->used[fit->used_count++] = k;
-		code = backend_cpu.stack_upload(fit->measured, k, 1, mine->used ? view : fit->scratch, err);
+		code = fit->backend->stack_upload(fit->measured, k, 1, mine->used ? view : fit->scratch, err);
 	}
 	return code;
 }
@@ -263,19 +267,19 @@ int registration_place(struct registration *fit, const struct path *path, struct
 			path_motion(path, fit->views[k].at, &fit->views[k].view, motion);
 		fit->geometry.views[k] = view_of_moved(&fit->views[k].view, motion);
 	}
-	backend_cpu.plan_free(fit->plan);
+	fit->backend->plan_free(fit->plan);
 	fit->plan = NULL;
-	return backend_cpu.plan_new(fit->device, &options, &fit->plan, err);
+	return fit->backend->plan_new(fit->device, &options, &fit->plan, err);
 }
 
 int registration_iterate(struct registration *fit, struct error *err)
 {
 	const struct cancel *cancel = fit->watch == NULL ? NULL : fit->watch->cancel;
 	struct iteration_sums sums;
-	int code = backend_cpu.sart_iterate(fit->plan, fit->measured, fit->volume, cancel, &sums, err);
+	int code = fit->backend->sart_iterate(fit->plan, fit->measured, fit->volume, cancel, &sums, err);
 
 	if (code == 0)
-		code = backend_cpu.tv(fit->plan, fit->volume, &fit->tv, cancel, err);
+		code = fit->backend->tv(fit->plan, fit->volume, &fit->tv, cancel, err);
 	return code;
 }
 
@@ -285,13 +289,10 @@ int registration_iterate(struct registration *fit, struct error *err)
 static int project(struct registration *fit, const struct volume *volume, const int *views, int count, int image,
 		   struct error *err)
 {
-	const size_t pixels = pixels_of(fit);
-	float *to = fit->images + (size_t)image * (size_t)fit->geometry.count * pixels;
-	int code = backend_cpu.project(fit->plan, volume, views, count, fit->made, err);
+	float *to = fit->images + (size_t)image * (size_t)fit->geometry.count * pixels_of(fit);
+	int code = fit->backend->project(fit->plan, volume, views, count, fit->made, err);
 
-	for (int i = 0; i < count && code == 0; i++)
-		code = backend_cpu.stack_download(fit->made, i, 1, to + (size_t)views[i] * pixels, err);
-	return code;
+	return code == 0 ? fit->backend->stack_download(fit->made, 0, count, to, err) : code;
 }
 
 /* Image 0 becomes what the volume does not explain of these views. */
@@ -302,7 +303,7 @@ static int find_residuals(struct registration *fit, const int *views, int count,
 
 	for (int i = 0; i < count && code == 0; i++) {
 		const float *measured = fit->reduced->projections + (size_t)views[i] * pixels;
-		float *to = fit->images + (size_t)views[i] * pixels;
+		float *to = fit->images + (size_t)i * pixels;
 
 		for (size_t j = 0; j < pixels; j++)
 			to[j] = measured[j] - to[j];
@@ -364,14 +365,14 @@ static int thread_number(void)
 #endif
 }
 
-/* The view's squares and products, weighted, over the residual's variance. */
-static void add_up_view(struct registration *fit, int view)
+/* Squares and products of the i-th of the views in use, weighted, over the residual's variance. */
+static void add_up_view(struct registration *fit, int used)
 {
 	const int columns = fit->geometry.columns, rows = fit->geometry.rows;
 	const size_t pixels = pixels_of(fit), apart = (size_t)fit->geometry.count * pixels;
-	float *images = fit->images + (size_t)view * pixels;
+	float *images = fit->images + (size_t)used * pixels;
 	float *scratch = fit->scratch + 4 * pixels * (size_t)thread_number();
-	double *products = fit->views[view].products, weights = 0, cut;
+	double *products = fit->views[fit->used[used]].products, weights = 0, cut;
 	int count = 0;
 
 	memset(products, 0, PATH_PRODUCTS * sizeof(*products));
@@ -403,7 +404,7 @@ static void add_up_view(struct registration *fit, int view)
 /* One step of the path, from the volume as it is. */
 int registration_step(struct registration *fit, struct path *path, struct error *err)
 {
-	const struct backend *backend = &backend_cpu;
+	const struct backend *backend = fit->backend;
 	int code = find_residuals(fit, fit->used, fit->used_count, err);
 
 	if (code == 0)
@@ -420,7 +421,7 @@ int registration_step(struct registration *fit, struct path *path, struct error 
 		return code;
 #pragma omp parallel for schedule(dynamic)
 	for (int i = 0; i < fit->used_count; i++) {
-		add_up_view(fit, fit->used[i]);
+		add_up_view(fit, i);
 		pulse_beat();
 	}
 	return path_step(path, fit->views, fit->geometry.count,
@@ -436,7 +437,7 @@ int registration_measure(struct registration *fit, double *ret_squares, double *
 
 	*ret_sum = 0;
 	for (int i = 0; i < fit->held_count && code == 0; i++) {
-		float *image = fit->images + (size_t)fit->held[i] * pixels_of(fit);
+		float *image = fit->images + (size_t)i * pixels_of(fit);
 
 		keep_detail(fit, image, fit->scratch);
 		ret_squares[i] = 0;
@@ -456,8 +457,8 @@ int registration_alike(struct registration *fit, double *ret_alike, struct error
 	int code = project(fit, fit->volume, fit->held, fit->held_count, 1, err);
 
 	for (int i = 0; i < fit->held_count && code == 0; i++) {
-		const float *residual = fit->images + (size_t)fit->held[i] * pixels;
-		float *made = fit->images + apart + (size_t)fit->held[i] * pixels;
+		const float *residual = fit->images + (size_t)i * pixels;
+		float *made = fit->images + apart + (size_t)i * pixels;
 
 		keep_detail(fit, made, fit->scratch);
 		for (int row = EDGE; row < rows - EDGE; row++)
@@ -486,7 +487,7 @@ float *registration_keep_volume(struct registration *fit, struct error *err)
 
 	if (voxels == NULL)
 		error_set(err, ERR_NO_MEMORY, "no memory for a volume of %d voxels a side", fit->grid.size[0]);
-	else if (backend_cpu.volume_download(fit->volume, 0, fit->grid.size[2], voxels, err) < 0) {
+	else if (fit->backend->volume_download(fit->volume, 0, fit->grid.size[2], voxels, err) < 0) {
 		free(voxels);
 		voxels = NULL;
 	}
@@ -530,12 +531,12 @@ static void interpolate_row(struct registration *fit, const struct grid *grid, c
 int registration_start(struct registration *fit, const struct grid *grid, const float *voxels, struct error *err)
 {
 	if (voxels == NULL)
-		return backend_cpu.volume_fill(fit->volume, 0, err);
+		return fit->backend->volume_fill(fit->volume, 0, err);
 #pragma omp parallel for schedule(static)
 	for (int z = 0; z < fit->grid.size[2]; z++)
 		for (int y = 0; y < fit->grid.size[1]; y++)
 			interpolate_row(fit, grid, voxels, y, z);
-	return backend_cpu.volume_upload(fit->volume, fit->voxels, err);
+	return fit->backend->volume_upload(fit->volume, fit->voxels, err);
 }
 
 /* Trilinear at a point, mm; 0 beyond the outermost voxels. */
@@ -592,5 +593,5 @@ int registration_refer(struct registration *fit, const struct refine_reference *
 			refer_row(fit, reference, y, z);
 		pulse_beat();
 	}
-	return backend_cpu.volume_upload(fit->volume, fit->voxels, err);
+	return fit->backend->volume_upload(fit->volume, fit->voxels, err);
 }

@@ -22,12 +22,14 @@ struct registration {
 	struct orbit orbit; /* of the bins */
 	struct sart_options sart;
 	struct tv_options tv;
-	struct device *device;
-	struct plan *plan; /* of `geometry` */
+	const struct backend *backend;
+	struct device *device; /* borrowed */
+	struct plan *plan;     /* of `geometry` */
 	struct stack *measured, *made;
 	struct volume *volume, *work;
 	float *voxels, *derived; /* of the grid */
-	float *images;           /* [REGISTRATION_IMAGES][view][row][column]: the residual, and derivatives */
+	/* [REGISTRATION_IMAGES][used, or held][row][column]: the residual, and derivatives. */
+	float *images;
 	float *scratch;          /* [threads][4][row][column] */
 	struct path_view *views; /* [geometry.count] */
 	int *used, *held;        /* numbers of views, */
@@ -36,6 +38,7 @@ struct registration {
 
 /* All that is pointed to is borrowed. */
 struct registration_options {
+	const struct refine_device *on; /* all but registration_updates need it */
 	const struct reduced *reduced;
 	const struct orbit *orbit; /* of the scan; only registration_open needs it */
 	enum refine_kind kind;
@@ -52,8 +55,8 @@ struct registration_options {
 	bool empty, wide;
 };
 
-/* Bytes of the host's memory, and how many updates of a voxel by a view an FDK of the level is. */
-int registration_bytes(const struct registration_options *options, size_t *ret_bytes, struct error *err);
+/* Adds the memory that it takes, and how many updates of a voxel by a view an FDK of the level is. */
+int registration_add_bytes(const struct registration_options *options, struct refine_bytes *bytes, struct error *err);
 int registration_updates(const struct registration_options *options, double *ret_updates, struct error *err);
 /* Free with registration_clear. */
 int registration_open(struct registration *ret_fit, const struct registration_options *options, struct error *err);

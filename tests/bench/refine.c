@@ -5,7 +5,9 @@
  * FDK volume's root mean square error within the body, HU. Both are taken where the geometry fits the truth best as a
  * whole: no scan tells where the object lay. `make bench-refine` builds and runs it; tests/bench/results/refine.txt has
  * its table. Arguments: pixels along a row, views, degrees, first seed, seeds, first departure, the one behind the
- * last, the only body (0: head, 1: abdomen, 2: knee; -1: all), and the most voxels along a side of the FDK volume.
+ * last, the only body (0: head, 1: abdomen, 2: knee; -1: all), the most voxels along a side of the FDK volume, and the
+ * backend that refines and makes that volume. Where that is not the CPU's the CPU's refines, too, and how far apart the
+ * two put points is told in mm at the isocentre.
  */
 #include <math.h>
 #include <stdio.h>
@@ -172,10 +174,9 @@ static int compare(const struct geometry *truth, const struct geometry *said, do
 
 /* ---- the volume's error ---- */
 
-static int fdk_volume(const struct geometry *geometry, const float *projections, const struct grid *grid, float *ret,
-		      struct error *err)
+static int fdk_volume(const struct backend *backend, const struct geometry *geometry, const float *projections,
+		      const struct grid *grid, float *ret, struct error *err)
 {
-	const struct backend *backend = &backend_cpu;
 	struct orbit orbit = {0};
 	struct fdk_weights weights = {0};
 	struct device *device = NULL;
@@ -226,8 +227,8 @@ static int fdk_volume(const struct geometry *geometry, const float *projections,
 }
 
 /* HU, within the body but for its metal, in every other voxel along each axis. */
-static int body_error(const struct scan *scan, const struct geometry *geometry, const double motion[PATH_NUMBERS],
-		      int voxels, double *ret_hu, struct error *err)
+static int body_error(const struct backend *backend, const struct scan *scan, const struct geometry *geometry,
+		      const double motion[PATH_NUMBERS], int voxels, double *ret_hu, struct error *err)
 {
 	const struct phantom phantom = {.count = scan->body.count, .parts = (struct ellipsoid *)scan->body.parts};
 	struct geometry moved = {0};
@@ -247,7 +248,7 @@ static int body_error(const struct scan *scan, const struct geometry *geometry, 
 	for (int k = 0; k < geometry->count && code == 0; k++)
 		moved.views[k] = view_of_moved(&geometry->views[k], motion);
 	if (code == 0)
-		code = fdk_volume(&moved, scan->projections, &grid, volume, err);
+		code = fdk_volume(backend, &moved, scan->projections, &grid, volume, err);
 #pragma omp parallel for reduction(+ : squares, count) schedule(dynamic)
 	for (int z = 2; z < grid.size[2] - 2; z += 2)
 		for (int y = 0; y < grid.size[1]; y += 2)
@@ -280,34 +281,6 @@ static int body_error(const struct scan *scan, const struct geometry *geometry, 
 
 /* ---- one scan ---- */
 
-static int refine(const struct scan *scan, enum refine_kind kind, struct geometry *ret_geometry,
-		  struct refinement *ret_refinement, struct error *err)
-{
-	const size_t pixels = (size_t)scan->arm.columns * (size_t)scan->arm.rows;
-	struct reduced reduced = {0};
-	struct orbit orbit = {0};
-	int code = orbit_analyse(&orbit, &scan->said, err);
-
-	if (code == 0)
-		code = reduced_open(&reduced, &scan->said, &orbit, REFINE_VIEWS_MOST, REFINE_BINS_MOST, err);
-	for (int k = 0; k < scan->said.count && code == 0; k++)
-		if (reduced_wants(&reduced, k))
-			reduced_take(&reduced, k, scan->projections + (size_t)k * pixels);
-	if (code == 0)
-		code = refine_find(&reduced, &orbit, kind, BODY_WATER, NULL, NULL, ret_refinement, err);
-	if (code == 0)
-		code = geometry_copy(ret_geometry, &scan->said, err);
-	for (int k = 0; k < scan->said.count && code == 0; k++) {
-		double motion[PATH_NUMBERS];
-
-		path_motion(&ret_refinement->path, refine_place(&orbit, k), &scan->said.views[k], motion);
-		ret_geometry->views[k] = view_of_moved(&scan->said.views[k], motion);
-	}
-	reduced_clear(&reduced);
-	orbit_clear(&orbit);
-	return code;
-}
-
 /* Of all processors together, and of the clock on the wall. */
 static void read_clocks(double ret_seconds[2])
 {
@@ -318,42 +291,101 @@ static void read_clocks(double ret_seconds[2])
 	ret_seconds[1] = (double)now.tv_sec + 1e-9 * (double)now.tv_nsec;
 }
 
+static int refine(const struct scan *scan, enum refine_kind kind, const struct backend *backend,
+		  struct geometry *ret_geometry, struct refinement *ret_refinement, double ret_seconds[2],
+		  struct error *err)
+{
+	const size_t pixels = (size_t)scan->arm.columns * (size_t)scan->arm.rows;
+	struct refine_device on = {.backend = backend};
+	struct reduced reduced = {0};
+	struct orbit orbit = {0};
+	double began[2] = {0};
+	int code = orbit_analyse(&orbit, &scan->said, err);
+
+	if (code == 0)
+		code = backend->open(0, &(struct device_options){0}, &on.device, err);
+	read_clocks(began);
+	if (code == 0)
+		code = reduced_open(&reduced, &scan->said, &orbit, REFINE_VIEWS_MOST, REFINE_BINS_MOST, err);
+	for (int k = 0; k < scan->said.count && code == 0; k++)
+		if (reduced_wants(&reduced, k))
+			reduced_take(&reduced, k, scan->projections + (size_t)k * pixels);
+	if (code == 0)
+		code = refine_find(&reduced, &orbit, kind, BODY_WATER, &on, NULL, NULL, ret_refinement, err);
+	read_clocks(ret_seconds);
+	for (int i = 0; i < 2; i++)
+		ret_seconds[i] -= began[i];
+	if (code == 0)
+		code = geometry_copy(ret_geometry, &scan->said, err);
+	for (int k = 0; k < scan->said.count && code == 0; k++) {
+		double motion[PATH_NUMBERS];
+
+		path_motion(&ret_refinement->path, refine_place(&orbit, k), &scan->said.views[k], motion);
+		ret_geometry->views[k] = view_of_moved(&scan->said.views[k], motion);
+	}
+	backend->close(on.device);
+	reduced_clear(&reduced);
+	orbit_clear(&orbit);
+	return code;
+}
+
+/* Root mean square distance between where two geometries put points. */
+static double distance(const struct geometry *a, const struct geometry *b)
+{
+	static const double still[PATH_NUMBERS] = {0};
+	const int residuals = 2 * POINTS * ((a->count + STRIDE - 1) / STRIDE);
+	struct pair pair = {a, b};
+	double *each = malloc((size_t)residuals * sizeof(double)), squares = 0;
+
+	if (each == NULL)
+		return NAN;
+	distances(&pair, still, each);
+	for (int i = 0; i < residuals; i++)
+		squares += each[i] * each[i] / residuals;
+	free(each);
+	return sqrt(2 * squares);
+}
+
 static int measure(const struct departure *departure, enum kind kind, int seed, int columns, int count, double arc,
-		   int voxels, struct error *err)
+		   int voxels, const struct backend *backend, struct error *err)
 {
 	static const double still[PATH_NUMBERS] = {0};
 	struct scan scan;
-	struct geometry refined = {0};
-	struct refinement refinement;
-	double mm[2], hu[4], motion[2][PATH_NUMBERS], began[2] = {0}, ended[2] = {0};
+	struct geometry refined = {0}, beside = {0};
+	struct refinement refinement, other;
+	double mm[2], hu[4], motion[2][PATH_NUMBERS], seconds[2] = {0}, cpu_seconds[2] = {0};
 	int code = open_scan(&scan, departure, kind, seed, columns, count, arc, err);
 
-	if (code == 0) {
-		read_clocks(began);
-		code = refine(&scan, departure->kind, &refined, &refinement, err);
-		read_clocks(ended);
-	}
+	if (code == 0)
+		code = refine(&scan, departure->kind, backend, &refined, &refinement, seconds, err);
+	if (code == 0 && backend != &backend_cpu)
+		code = refine(&scan, departure->kind, &backend_cpu, &beside, &other, cpu_seconds, err);
 	if (code == 0)
 		code = compare(&scan.truth, &scan.said, &mm[0], motion[0], err);
 	if (code == 0)
 		code = compare(&scan.truth, &refined, &mm[1], motion[1], err);
 	if (code == 0)
-		code = body_error(&scan, &scan.truth, still, voxels, &hu[0], err);
+		code = body_error(backend, &scan, &scan.truth, still, voxels, &hu[0], err);
 	if (code == 0)
-		code = body_error(&scan, &scan.said, still, voxels, &hu[1], err);
+		code = body_error(backend, &scan, &scan.said, still, voxels, &hu[1], err);
 	if (code == 0)
-		code = body_error(&scan, &scan.said, motion[0], voxels, &hu[2], err);
+		code = body_error(backend, &scan, &scan.said, motion[0], voxels, &hu[2], err);
 	if (code == 0)
-		code = body_error(&scan, &refined, motion[1], voxels, &hu[3], err);
+		code = body_error(backend, &scan, &refined, motion[1], voxels, &hu[3], err);
 	if (code == 0)
 		printf("%-26s %-18s %3d  %5.0f %6.1f %6.1f %6.1f %6.1f  %6.3f %6.3f  %-4s %5.2f %% %3d/%2d %5d %7.1f "
 		       "%6.1f\n",
 		       departure->name, kind_names[kind], seed, arc, hu[0], hu[1], hu[2], hu[3], mm[0], mm[1],
 		       refinement.accepted ? "yes" : "no", 100 * (1 - refinement.held_after / refinement.held_before),
-		       refinement.better, refinement.held_out, refinement.path.knots, ended[0] - began[0],
-		       ended[1] - began[1]);
+		       refinement.better, refinement.held_out, refinement.path.knots, seconds[0], seconds[1]);
+	if (code == 0 && backend != &backend_cpu)
+		printf("%-26s %-18s the CPU's is %.4f mm apart, unexplained less %.3f %% beside %.3f, %.1f s of "
+		       "processor, %.1f s\n",
+		       "", "", distance(&beside, &refined), 100 * (1 - other.held_after / other.held_before),
+		       100 * (1 - refinement.held_after / refinement.held_before), cpu_seconds[0], cpu_seconds[1]);
 	fflush(stdout);
 	geometry_clear(&refined);
+	geometry_clear(&beside);
 	close_scan(&scan);
 	return code;
 }
@@ -365,8 +397,13 @@ int main(int argc, char **argv)
 	const int first = argc > 4 ? atoi(argv[4]) : 21, seeds = argc > 5 ? atoi(argv[5]) : 1;
 	const int from = argc > 6 ? atoi(argv[6]) : 0, to = argc > 7 ? atoi(argv[7]) : DEPARTURES;
 	const int only = argc > 8 ? atoi(argv[8]) : -1, voxels = argc > 9 ? atoi(argv[9]) : 160;
+	const struct backend *backend = backend_find(argc > 10 ? argv[10] : "cpu");
 	const int body = only < 0 ? HEAD : only, bodies = only < 0 ? KNEE + 1 : only + 1;
 
+	if (backend == NULL) {
+		fprintf(stderr, "no backend %s\n", argv[10]);
+		return EXIT_FAILURE;
+	}
 	printf("%-26s %-18s %3s  %5s %6s %6s %6s %6s  %6s %6s  %-4s %7s %6s %5s %7s %6s\n", "departure", "body", "",
 	       "arc", "true", "said", "whole", "after", "mm", "after", "kept", "better", "views", "knots", "seconds",
 	       "wall");
@@ -378,8 +415,8 @@ int main(int argc, char **argv)
 
 				if (departures[d].kind == REFINE_MOTION && kind != HEAD)
 					continue;
-				if (measure(&departures[d], (enum kind)kind, seed, columns, views, arc, voxels, &err) <
-				    0) {
+				if (measure(&departures[d], (enum kind)kind, seed, columns, views, arc, voxels, backend,
+					    &err) < 0) {
 					fprintf(stderr, "%s\n", err.text);
 					return EXIT_FAILURE;
 				}

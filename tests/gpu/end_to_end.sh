@@ -92,6 +92,27 @@ EOF
 else
 	echo "SKIPPED: pixels that drift need python3"
 fi
+# The circle's geometry told of the same projections: where each view stood, found on both.
+if command -v python3 >/dev/null; then
+	cp -r "$work/scan" "$work/wanders"
+	cbct simulate -o "$work/circle" --phantom head --scale 45 --density 0.0192 --views 120 --arc 200 --columns 260 --rows 220 \
+		--pixel 1.2 >>"$work/simulate.log" 2>&1
+	cp "$work/circle/scan.json" "$work/wanders/"
+	for backend in cuda cpu; do
+		cbct recon "$work/wanders" --grid 64 --spacing 1.5 --refine-geometry --backend $backend -o "$work/refined-$backend" \
+			>/dev/null 2>"$work/refined-$backend.log"
+	done
+	apart=$(python3 - "$work/refined-cuda" "$work/refined-cpu" <<'EOF'
+import json, math, sys
+found = [json.load(open(path + "/refinement.json")) for path in sys.argv[1:]]
+assert all(one["accepted"] and len(one["views"]) == 120 for one in found)
+print(max(math.dist(a["shift_mm"], b["shift_mm"]) for a, b in zip(*(one["views"] for one in found))))
+EOF
+	)
+	check "each view stands where the CPU's refinement has it, within 0.001 mm ($apart)" below "${apart:-nan}" 0.001
+else
+	echo "SKIPPED: comparing refinements needs python3"
+fi
 again=$(cbct submit "$scan" "${recipe[@]}" --tv gradient --wait 2>>"$work/watch" | tail -1)
 third=$(cbct submit "$scan" "${recipe[@]}" --tv gradient --wait 2>>"$work/watch" | tail -1)
 # The voxels alone: a file says which job it is of.

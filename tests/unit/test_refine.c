@@ -11,7 +11,9 @@
 #include <omp.h>
 #endif
 
+#include "core/cards/cards.h"
 #include "core/fit/least_squares.h"
+#include "core/outofcore/outofcore.h"
 #include "core/refine/refine.h"
 #include "core/scan/phantom.h"
 #include "tests/unit/arm.h"
@@ -336,8 +338,8 @@ static void note_share(void *context, double share)
  * A sway of the detector along its columns and rows that no common motion explains, `sway` mm; a turn of the head. With
  * a reference that many views, noisy ones.
  */
-static struct found find_with(double sway, double nod, int views, const struct refine_reference *reference,
-			      double aside)
+static struct found find_on(const struct refine_device *on, double sway, double nod, int views,
+			    const struct refine_reference *reference, double aside)
 {
 	const struct arm arm = {
 	    .columns = COLUMNS, .rows = ROWS, .count = views, .pixel = PIXEL, .first = .2, .step = 3.5 / (views - 1)};
@@ -369,7 +371,7 @@ static struct found find_with(double sway, double nod, int views, const struct r
 	ck_assert_int_eq(reduced_open(&reduced, &said, &orbit, REFINE_VIEWS_MOST, REFINE_BINS_MOST, &err), 0);
 	for (int k = 0; k < views; k++)
 		reduced_take(&reduced, k, projections + (size_t)k * COLUMNS * ROWS);
-	ck_assert_msg(refine_find(&reduced, &orbit, nod != 0 ? REFINE_MOTION : REFINE_GEOMETRY, WATER, reference,
+	ck_assert_msg(refine_find(&reduced, &orbit, nod != 0 ? REFINE_MOTION : REFINE_GEOMETRY, WATER, on, reference,
 				  &watch, &found.refinement, &err) == 0,
 		      "%s", err.text);
 	for (int k = 0; k < views; k++) {
@@ -389,6 +391,19 @@ static struct found find_with(double sway, double nod, int views, const struct r
 	geometry_clear(&truth);
 	geometry_clear(&refined);
 	free(projections);
+	return found;
+}
+
+static struct found find_with(double sway, double nod, int views, const struct refine_reference *reference,
+			      double aside)
+{
+	struct refine_device on = {.backend = &backend_cpu};
+	struct found found;
+	struct error err;
+
+	ck_assert_int_eq(backend_cpu.open(0, &(struct device_options){0}, &on.device, &err), 0);
+	found = find_on(&on, sway, nod, views, reference, aside);
+	backend_cpu.close(on.device);
 	return found;
 }
 
@@ -502,6 +517,33 @@ START_TEST(any_number_of_threads_finds_the_same)
 }
 END_TEST
 
+/* _i: out of core, and on two cards. They differ from the whole by rounding. */
+START_TEST(what_is_made_of_a_backend_finds_the_same)
+{
+	const struct found whole = find(1.5, 0);
+	struct device *below;
+	struct refine_device on = {.backend = _i == 0 ? &backend_outofcore : &backend_cards};
+	const struct device_options options = {.threads = 2};
+	struct found found;
+	struct error err;
+	double most = 0;
+
+	ck_assert_int_eq(backend_cpu.open(0, &options, &below, &err), 0);
+	ck_assert_int_eq(_i == 0 ? outofcore_open(&backend_cpu, below, &on.device, &err)
+				 : cards_open(&backend_cpu, NULL, 2, &options, &on.device, &err),
+			 0);
+	found = find_on(&on, 1.5, 0, VIEWS, NULL, 0);
+	on.backend->close(on.device);
+	backend_cpu.close(below);
+	ck_assert(found.refinement.accepted && found.refinement.path.knots == whole.refinement.path.knots);
+	for (int k = 0; k < whole.refinement.path.knots; k++)
+		for (int i = 0; i < PATH_NUMBERS; i++)
+			most =
+			    fmax(most, fabs(found.refinement.path.numbers[k][i] - whole.refinement.path.numbers[k][i]));
+	ck_assert_double_lt(most, 1e-3);
+}
+END_TEST
+
 /* ---- in a job ---- */
 
 /* Asks how often it was asked, and says yes from one time on. */
@@ -602,6 +644,7 @@ Suite *refine_suite(void)
 	tcase_add_loop_test(scans, few_noisy_views_are_registered_with_a_reference, 0, 2);
 	tcase_add_test(scans, a_reference_of_something_else_is_not_followed);
 	tcase_add_test(scans, any_number_of_threads_finds_the_same);
+	tcase_add_loop_test(scans, what_is_made_of_a_backend_finds_the_same, 0, 2);
 	tcase_add_test(scans, a_refinement_makes_room);
 	suite_add_tcase(suite, scans);
 	return suite;
