@@ -403,6 +403,8 @@ struct backend {
 	/* `count` slices from z_from on to z_to and on; likewise. */
 	int (*volume_pass)(const struct volume *from, int z_from, struct volume *to, int z_to, int count,
 			   struct error *err);
+	/* Gives back what the process keeps of a device whose last has been closed. NULL: nothing. */
+	void (*release)(int index);
 };
 
 /*

@@ -365,10 +365,14 @@ static int open_devices(const struct worker *worker, const char *names, struct d
 	return cards_open(worker->backend, ret->numbers, ret->count, &worker->options, &ret->device, err);
 }
 
+/* The devices beside the worker's own, the first, are given back whole: other jobs come to them. */
 static void close_devices(const struct worker *worker, struct devices *devices)
 {
-	if (devices->device != worker->device)
-		backend_cards.close(devices->device);
+	if (devices->device == worker->device)
+		return;
+	backend_cards.close(devices->device);
+	for (int i = 1; i < devices->count && worker->backend->release != NULL; i++)
+		worker->backend->release(devices->numbers[i]);
 }
 
 /* The error of a device names it; returns its place among the job's. */

@@ -12,9 +12,10 @@ static const int THREADS = 256;
 /* ---- from card to card ---- */
 
 /* Access stays once it is there, and asking for it again is an error: a process remembers what it has. */
+static std::atomic<bool> reached[GPUS_MOST][GPUS_MOST];
+
 static bool reach(const struct device *device, const struct device *other)
 {
-	static std::atomic<bool> reached[GPUS_MOST][GPUS_MOST];
 	std::atomic<bool> *there = &reached[device->index][other->index];
 	int can = 0;
 
@@ -38,6 +39,16 @@ bool cuda_connect(struct device *const devices[], int count)
 	}
 	cudaGetLastError();
 	return all;
+}
+
+/* Ends the process' context there, half a gigabyte of the card; the next device that is opened there makes another. */
+void cuda_release(int index)
+{
+	if (cudaSetDevice(index) != cudaSuccess || cudaDeviceReset() != cudaSuccess)
+		cudaGetLastError();
+	for (int i = 0; i < GPUS_MOST; i++)
+		reached[index][i] = reached[i][index] = false;
+	*backproject_constants(index) = {};
 }
 
 /*

@@ -279,4 +279,5 @@ const struct backend backend_cuda = {
     .connect = cuda_connect,
     .stack_pass = cuda_stack_pass,
     .volume_pass = cuda_volume_pass,
+    .release = cuda_release,
 };

@@ -624,6 +624,7 @@ int cuda_tv_steps(struct plan *plan, struct volume *volume, const struct tv_opti
 int cuda_tv_pass(struct plan *from, const struct volume *from_volume, int z_from, struct plan *to,
 		 struct volume *to_volume, int z_to, int count, const struct tv_options *options, int done,
 		 struct error *err);
+void cuda_release(int index);
 int cuda_norms(struct plan *plan, const struct volume *volume, const struct volume *other, double unit,
 	       struct volume_norms *ret_norms, struct error *err);
 int cuda_volume_axpby(double a, const struct volume *x, double b, struct volume *y, struct error *err);

@@ -21,14 +21,14 @@ int supervise_check_devices(const struct supervise *supervise, struct job_reques
 static const size_t CONTEXT_BYTES = (size_t)544 << 20;
 
 /*
- * The memory that may come free until the job's turn; the worker looks again when it begins. A worker that has had
- * other cards keeps its context on them, so that each may have those of all. A job that does not fit on its cards runs
- * out of core, with its volumes in the host's memory. Shares of the processor have one memory.
+ * The memory that may come free until the job's turn; the worker looks again when it begins. A card has its worker's
+ * context, and that of the job's process while it is lent. A job that does not fit on its cards runs out of core, with
+ * its volumes in the host's memory. Shares of the processor have one memory.
  */
-static size_t memory_available(const struct supervise *supervise, const char *backend, size_t bytes_total, int devices)
+static size_t memory_available(const char *backend, size_t bytes_total, int devices)
 {
 	const bool shared = strcmp(backend, "cpu") == 0;
-	const size_t contexts = CONTEXT_BYTES * (size_t)supervise->regular;
+	const size_t contexts = CONTEXT_BYTES * (devices > 1 ? 2 : 1);
 	const size_t card = bytes_total > contexts ? bytes_total - contexts : 0;
 	const size_t bytes = shared ? bytes_total : card * (size_t)devices;
 	struct host_memory host;
@@ -79,8 +79,7 @@ static int memory_needed(const char *backend, int devices, const struct scan *sc
 
 bool devices_have_room(const struct worker *worker, const struct job *job, int count)
 {
-	return job_least_bytes(job) <=
-	       memory_available(worker->supervise, worker->backend, worker->info.bytes_total, count);
+	return job_least_bytes(job) <= memory_available(worker->backend, worker->info.bytes_total, count);
 }
 
 int supervise_check_memory(struct supervise *supervise, const struct scan *scan, const struct job_request *request,
@@ -106,7 +105,7 @@ int supervise_check_memory(struct supervise *supervise, const struct scan *scan,
 		code = memory_needed(facts[i].backend, devices, scan, recipe, &memory, err);
 		if (code != 0)
 			return code;
-		memory.available = memory_available(supervise, facts[i].backend, facts[i].bytes_total, devices);
+		memory.available = memory_available(facts[i].backend, facts[i].bytes_total, devices);
 		if (memory.total <= memory.available) {
 			*ret_memory = memory;
 			return 0;

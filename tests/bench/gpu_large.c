@@ -2,12 +2,20 @@
  * One large reconstruction on several cards, from projections of an exact phantom that are made on them, checked
  * against the phantom in sampled slices: seconds of its parts, apart from each other.
  *
- *   gpu_large CARDS SIZE VIEWS PIXELS [ITERATIONS]    SIZE^3 voxels from VIEWS of PIXELS^2: FDK, or SIRT iterations
+ *   gpu_large CARDS SIZE VIEWS PIXELS turned|untilted ITERATIONS [PREFIX]
+ *
+ * SIZE^3 voxels from VIEWS of PIXELS^2: so many SIRT iterations, or FDK (0). The detector is turned by a degree or not
+ * at all. With PREFIX each card's slab is written there as int16 in HU, all cards at once; to nowhere if it is
+ * /dev/null.
  */
+#include <fcntl.h>
 #include <math.h>
+#include <pthread.h>
+#include <stdint.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
+#include <unistd.h>
 
 #include "core/cards/internal.h"
 #include "tests/bench/gpu_phantom.h"
@@ -28,7 +36,7 @@ struct large {
 	struct error err;
 };
 
-static void large_make(struct large *large, int cards, int size, int views, int pixels)
+static void large_make(struct large *large, int cards, int size, int views, int pixels, enum bend bend)
 {
 	const struct scene_options options = {
 	    .columns = pixels,
@@ -38,7 +46,7 @@ static void large_make(struct large *large, int cards, int size, int views, int 
 	    .pixel = {.2888 * 1024 / pixels, .2888 * 1024 / pixels},
 	    .size = {size, size, size},
 	    .spacing = {.0931 * 1024 / size, .0931 * 1024 / size, .0931 * 1024 / size},
-	    .bend = BEND_TURNED};
+	    .bend = bend};
 	const int indices[CARDS_MOST] = {0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15};
 
 	scene_make(&large->scene, "large", &options);
@@ -248,24 +256,103 @@ static void compare_slices(struct large *large)
 	free(volume);
 }
 
+/* ---- writing ---- */
+
+enum { CHUNK = 8 }; /* slices on their way */
+
+struct writer {
+	struct large *large;
+	int card, fd;
+	bool wrong;
+	pthread_t thread;
+};
+
+static void *write_slab(void *argument)
+{
+	struct writer *writer = argument;
+	const struct large *large = writer->large;
+	const int *size = large->scene.grid.size, *first = large->volume->first;
+	const size_t slice = (size_t)size[0] * (size_t)size[1];
+	const int count = first[writer->card + 1] - first[writer->card];
+	float *values = malloc(CHUNK * slice * sizeof(float));
+	int16_t *units = malloc(CHUNK * slice * sizeof(int16_t));
+	struct error err = {0};
+
+	for (int z = 0; z < count; z += CHUNK) {
+		const int now = count - z < CHUNK ? count - z : CHUNK;
+		const char *left = (const char *)units;
+		size_t bytes = (size_t)now * slice * sizeof(int16_t);
+
+		must(backend_cuda.volume_download(large->volume->part[writer->card], z, now, values, &err), &err,
+		     "download");
+#pragma omp parallel for schedule(static)
+		for (size_t i = 0; i < (size_t)now * slice; i++) {
+			const float hu = 1000 * values[i] / (float)WATER - 1000;
+
+			units[i] = (int16_t)lrintf(fminf(fmaxf(hu, INT16_MIN), INT16_MAX));
+		}
+		while (bytes > 0) {
+			const ssize_t done = write(writer->fd, left, bytes);
+
+			if (done <= 0) {
+				writer->wrong = true;
+				goto out;
+			}
+			left += done;
+			bytes -= (size_t)done;
+		}
+	}
+out:
+	free(units);
+	free(values);
+	return NULL;
+}
+
+static void write_slabs(struct large *large, const char *prefix)
+{
+	struct writer writers[CARDS_MOST];
+	const double start = seconds();
+	bool wrong = false;
+
+	for (int c = 0; c < large->plan->parts; c++) {
+		char path[4096];
+
+		snprintf(path, sizeof(path), strcmp(prefix, "/dev/null") == 0 ? "%s" : "%s-%d.int16", prefix, c);
+		writers[c] = (struct writer){.large = large, .card = c, .fd = open(path, O_WRONLY | O_CREAT, 0644)};
+		if (writers[c].fd < 0 || pthread_create(&writers[c].thread, NULL, write_slab, &writers[c]) != 0) {
+			fprintf(stderr, "%s: cannot be written\n", path);
+			exit(1);
+		}
+	}
+	for (int c = 0; c < large->plan->parts; c++) {
+		pthread_join(writers[c].thread, NULL);
+		wrong |= writers[c].wrong | (close(writers[c].fd) != 0);
+	}
+	printf("slabs written as int16 in %.1f s%s\n", seconds() - start, wrong ? ", NOT WHOLE" : "");
+}
+
 int main(int argc, char **argv)
 {
 	struct large large = {0};
 	struct device_info info;
 	const double start = seconds();
+	const bool turned = argc > 5 && strcmp(argv[5], "turned") == 0;
 
-	if (argc < 5) {
-		fprintf(stderr, "gpu_large CARDS SIZE VIEWS PIXELS [ITERATIONS]\n");
+	if (argc < 7 || (!turned && strcmp(argv[5], "untilted") != 0)) {
+		fprintf(stderr, "gpu_large CARDS SIZE VIEWS PIXELS turned|untilted ITERATIONS [PREFIX]\n");
 		return 2;
 	}
-	large_make(&large, atoi(argv[1]), atoi(argv[2]), atoi(argv[3]), atoi(argv[4]));
+	large_make(&large, atoi(argv[1]), atoi(argv[2]), atoi(argv[3]), atoi(argv[4]),
+		   turned ? BEND_TURNED : BEND_NONE);
 	backend_cards.describe(large.device, &info);
-	printf("%s: %s^3 voxels from %s views of %s^2; opened in %.1f s\n", info.name, argv[2], argv[3], argv[4],
-	       seconds() - start);
-	if (argc > 5)
-		run_sirt(&large, atoi(argv[5]));
+	printf("%s: %s^3 voxels from %s views of %s^2, %s; opened in %.1f s\n", info.name, argv[2], argv[3], argv[4],
+	       argv[5], seconds() - start);
+	if (atoi(argv[6]) > 0)
+		run_sirt(&large, atoi(argv[6]));
 	else
 		run_fdk(&large);
+	if (argc > 7)
+		write_slabs(&large, argv[7]);
 	backend_cards.describe(large.device, &info);
 	printf("%.1f GiB of each card are taken\n",
 	       (double)(info.bytes_total - info.bytes_free) / atoi(argv[1]) / (double)(1 << 30));

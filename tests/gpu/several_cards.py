@@ -26,6 +26,7 @@ BACKEND = os.environ.get("BACKEND", "cuda")
 SIZE = int(os.environ.get("SIZE", "256"))
 CARDS = int(os.environ.get("CARDS", "0"))
 PATIENCE = 120.0  # s; no assertion
+CONTEXT_MIB = 544  # of a process on a card, as daemon/jobs/memory.c counts it
 BOUND_HU = 0.5  # root mean square between one card and several, as between a card and the processor
 failures = 0
 began = time.monotonic()
@@ -220,9 +221,11 @@ def memory(daemon: Daemon, scan: str, before: List[int]) -> None:
         daemon.end(job, "cancelled")
         daemon.idle()
         told = document["memory"]["total"] / 2**20
-        grown = sum(busy) - sum(idle)
-        check(f"memory, {devices} devices: MiB before any worker {before}, idle {idle}, busy {busy}, after {memory_used()}; "
-              f"told {told:.0f}, seen {grown}", grown <= told)
+        grown, after = sum(busy) - sum(idle), memory_used()
+        # A job on several cards leaves nothing of itself on those that were lent to it.
+        kept = max(now - then for now, then in zip(after[1:], idle[1:])) if devices > 1 else 0
+        check(f"memory, {devices} devices: MiB before any worker {before}, idle {idle}, busy {busy}, after {after}; "
+              f"told {told:.0f}, seen {grown}", grown <= told + CONTEXT_MIB * (devices - 1) and kept < 32)
 
 
 def kills(daemon: Daemon, scan: str) -> None:
@@ -304,15 +307,21 @@ def dies(scan_folder: pathlib.Path) -> None:
             job = daemon.post(recipe, devices=CARDS)
             daemon.job(job, lambda d: d["iteration"] >= 2)
             fault.write_text(str(card))
+            while fault.exists():
+                time.sleep(0.005)
+            failed = time.monotonic()
+            daemon.job(job, lambda d: d["attempts"] == 2 and d["state"] != "queued")
+            gave_up = time.monotonic() - failed
             document = daemon.end(job)
             devices = daemon.call("GET", "/v1/devices")["devices"]
             warnings = [w["code"] for w in document["warnings"]]
             off = off_hu(daemon, document, whole)
             rows = [row["iteration"] for row in document["history"]]
-            check(f"card {card} fails: attempts {document['attempts']}, ran_on {document['ran_on']}, warnings {warnings}, "
+            check(f"card {card} fails: goes on after {gave_up:.2f} s, attempts {document['attempts']}, "
+                  f"ran_on {document['ran_on']}, warnings {warnings}, "
                   f"{off:.2g} HU from one card, errors {[d['errors'] for d in devices]}, "
                   f"{devices[card]['last_error']}",
-                  not fault.exists() and document["attempts"] == 2 and sorted(document["ran_on"]) == [c for c in ALL if c != card]
+                  gave_up < 5 and document["attempts"] == 2 and sorted(document["ran_on"]) == [c for c in ALL if c != card]
                   and off <= BOUND_HU and rows == list(range(1, 13)) and "fewer_devices" in warnings)
             say(f"     last errors: {[d['last_error'] for d in devices]}")
         except RuntimeError as error:
