@@ -182,17 +182,15 @@ struct device_view {
  * first of the next, so that the four columns of a sample are always in one.
  *
  * A value is a float or, in standard precision, a __half2 of the voxel and the
- * next one along the row axis: one load brings both that a sample lies between. Where many
- * views are projected in float, it is the voxel and its second difference along the fast
- * axis, and the slices of one axis after the other stand in the room of both.
+ * next one along the row axis: one load brings both that a sample lies between.
  */
 enum { SLICE_PAD = 8, SLICE_HELD = 2, PANEL = 64, SLICE_SHARED = 3, SLICE_STEP = PANEL - SLICE_SHARED };
 struct slices_shape {
 	int slices, rows, fast;
-	int row;       /* floats from row to row */
-	int panel;     /* floats from panel to panel; 0: rows are whole */
-	size_t slice;  /* floats from slice to slice */
-	size_t floats; /* where a value has four bytes */
+	int row;      /* floats from row to row */
+	int panel;    /* floats from panel to panel; 0: rows are whole */
+	size_t slice; /* floats from slice to slice */
+	size_t floats;
 };
 struct slices {
 	float *data; /* row 0 of slice 0; where rows are whole, its value 0, else -SLICE_HELD is first in its panel */
@@ -200,6 +198,7 @@ struct slices {
 	int row, panel;
 };
 struct slices_shape slices_shape_make(int slices, int rows, int fast, bool panels);
+struct slices slices_at(float *memory, const struct slices_shape *shape);
 
 /*
  * A batch of projections for the backprojection by rows, [slot][panel][row][PANEL]. In float
@@ -276,7 +275,6 @@ struct plan_shape {
 	int view_rows;   /* forward_rows where SART goes by copies: fewer where a single view sees little of the grid */
 	bool rows_apart; /* they share columns, but no values */
 	bool halves;     /* the forward projection reads pairs in half precision */
-	bool seconds;    /* it reads floats with their second differences, one axis at a time */
 	int back_voxels; /* voxels of one window in the untilted backprojection; 0: the general one */
 	bool is_small;   /* launches take longer than samples: the plainest kernels */
 	enum neighbours back_neighbours;
@@ -389,10 +387,6 @@ struct shadow shadow_of(const struct geometry *geometry, const struct grid *grid
 int layout_scale(struct plan *plan, const float *volume, const float *projections, struct error *err);
 /* -> scratch; in half precision by the scale found last */
 int layout_slices(struct plan *plan, const float *volume, struct error *err);
-/* With second differences, those across x (0) or y (1). */
-int layout_seconds(struct plan *plan, const float *volume, int axis, struct error *err);
-/* Where the slices across x (0) or y (1) lie in the scratch. */
-struct slices layout_across(const struct plan *plan, int axis);
 /*
  * Rows that lean are backprojected by rows for FDK only: at the detector's edges a voxel's line meets other pixels than
  * the voxel does, which SART's division by column sums would show.

@@ -26,13 +26,9 @@ struct slices_shape slices_shape_make(int slices, int rows, int fast, bool panel
 	return shape;
 }
 
-struct slices layout_across(const struct plan *plan, int axis)
+struct slices slices_at(float *memory, const struct slices_shape *shape)
 {
-	const struct slices_shape *shape = axis == 0 ? &plan->along_x : &plan->along_y;
-	const size_t before = (size_t)shape->row * (SLICE_PAD + 1);
-	const size_t at = plan->shape.seconds ? 2 * before : before + (axis == 0 ? 0 : plan->along_x.floats);
-
-	return {plan->scratch + at, shape->slice, shape->row, shape->panel};
+	return {memory + (size_t)shape->row * (SLICE_PAD + 1), shape->slice, shape->row, shape->panel};
 }
 
 struct pairs_shape pairs_shape_make(int columns, int rows)
@@ -145,23 +141,8 @@ static __device__ __forceinline__ __half2 both_lower(__half2 value)
 {
 	return __low2half2(value);
 }
-static __device__ __forceinline__ float2 both_lower(float2 value)
-{
-	return value;
-}
 
-/* What stands beside the outer places: a second difference is not held. */
-template <typename T>
-static __device__ __forceinline__ T beside(T value)
-{
-	return value;
-}
-static __device__ __forceinline__ float2 beside(float2 value)
-{
-	return {value.x, 0};
-}
-
-enum { RUN = 8, SECONDS_RUN = 4, WIDE = 32, HIGH = 32 };
+enum { RUN = 8, WIDE = 32, HIGH = 32 };
 
 /*
  * A place of a slice, in all its rows; beside it at the fast axis' ends stands what
@@ -195,22 +176,21 @@ struct column {
 		if (shared > 0)
 			here[before] = value;
 		if (first)
-			here[-1] = here[-2] = beside(value);
+			here[-1] = here[-2] = value;
 		if (last) {
-			here[1] = here[2] = beside(value);
+			here[1] = here[2] = value;
 			if (shared > 1)
-				here[before + 1] = beside(value);
+				here[before + 1] = value;
 			if (shared > 2)
-				here[before + 2] = beside(value);
+				here[before + 2] = value;
 		}
 	}
 
-	/* COUNT rows from `from` on, and what is held below the first and above the last. */
-	template <int COUNT>
-	__device__ __forceinline__ void put_run(int from, int rows, const T (&value)[COUNT]) const
+	/* RUN rows from `from` on, and what is held below the first and above the last. */
+	__device__ __forceinline__ void put_run(int from, int rows, const T value[RUN]) const
 	{
 #pragma unroll
-		for (int k = 0; k < COUNT; k++) {
+		for (int k = 0; k < RUN; k++) {
 			if (from + k >= rows)
 				return;
 			put(from + k, value[k]);
@@ -261,7 +241,8 @@ int layout_slices(struct plan *plan, const float *volume, struct error *err)
 {
 	const int *size = plan->grid.size;
 	cudaStream_t stream = plan->device->stream;
-	struct slices x = layout_across(plan, 0), y = layout_across(plan, 1);
+	struct slices x = slices_at(plan->scratch, &plan->along_x);
+	struct slices y = slices_at(plan->scratch + plan->along_x.floats, &plan->along_y);
 	const unsigned *most = plan->most + MOST_VOLUME;
 	dim3 blocks(divide_up(size[0], WIDE), divide_up(size[1], HIGH), divide_up(size[2], RUN)), threads(WIDE, HIGH);
 
@@ -269,57 +250,6 @@ int layout_slices(struct plan *plan, const float *volume, struct error *err)
 		to_slices<__half2><<<blocks, threads, 0, stream>>>(volume, size[0], size[1], size[2], x, y, most);
 	else
 		to_slices<float><<<blocks, threads, 0, stream>>>(volume, size[0], size[1], size[2], x, y, most);
-	LAUNCHED();
-	return 0;
-}
-
-/* SECONDS_RUN planes of a tile, each voxel with its second difference along the fast axis of the slices. */
-template <bool ACROSS_X>
-static __global__ void __launch_bounds__(WIDE *HIGH)
-    to_seconds(const float *__restrict__ volume, int nx, int ny, int nz, const slices to)
-{
-	__shared__ float2 turned[SECONDS_RUN][WIDE][HIGH + 1];
-	const int x0 = blockIdx.x * WIDE, y0 = blockIdx.y * HIGH, z = blockIdx.z * SECONDS_RUN;
-	const int x = min(x0 + (int)threadIdx.x, nx - 1), y = min(y0 + (int)threadIdx.y, ny - 1);
-	const int count = ACROSS_X ? ny : nx, at = ACROSS_X ? y : x, step = ACROSS_X ? nx : 1;
-	const int below = at > 0 ? -step : 0, above = at + 1 < count ? step : 0;
-	int slice = y0 + threadIdx.y, fast = x0 + threadIdx.x;
-	float2 kept[SECONDS_RUN];
-
-#pragma unroll
-	for (int k = 0; k < SECONDS_RUN; k++) {
-		const float *from = volume + (((size_t)min(z + k, nz - 1) * ny + y) * nx + x);
-
-		kept[k] = {from[0], from[below] - 2.0f * from[0] + from[above]};
-		if (ACROSS_X)
-			turned[k][threadIdx.x][threadIdx.y] = kept[k];
-	}
-	if (ACROSS_X) {
-		const int thread = threadIdx.y * WIDE + threadIdx.x, tx = thread / HIGH, ty = thread % HIGH;
-
-		__syncthreads();
-		slice = x0 + tx;
-		fast = y0 + ty;
-#pragma unroll
-		for (int k = 0; k < SECONDS_RUN; k++)
-			kept[k] = turned[k][tx][ty];
-	}
-	if (slice < (ACROSS_X ? nx : ny) && fast < count)
-		column<float2>(to, slice, fast, count).put_run(z, nz, kept);
-}
-
-int layout_seconds(struct plan *plan, const float *volume, int axis, struct error *err)
-{
-	const int *size = plan->grid.size;
-	const struct slices to = layout_across(plan, axis);
-	dim3 blocks(divide_up(size[0], WIDE), divide_up(size[1], HIGH), divide_up(size[2], SECONDS_RUN)),
-	    threads(WIDE, HIGH);
-	cudaStream_t stream = plan->device->stream;
-
-	if (axis == 0)
-		to_seconds<true><<<blocks, threads, 0, stream>>>(volume, size[0], size[1], size[2], to);
-	else
-		to_seconds<false><<<blocks, threads, 0, stream>>>(volume, size[0], size[1], size[2], to);
 	LAUNCHED();
 	return 0;
 }

@@ -592,18 +592,6 @@ static __device__ __forceinline__ void upright_begin(const matched_job &job, con
 	tile.row.left[thread] = (short)left;
 }
 
-/*
- * The next row of the detector. Left to itself the compiler finds the rows of a loop by products of 64 bits, in nearly
- * twice as many instructions.
- */
-static __device__ __forceinline__ const float *upright_next(const float *row, ptrdiff_t step)
-{
-	const float *next;
-
-	asm("add.s64 %0, %1, %2;" : "=l"(next) : "l"(row), "l"(step * (ptrdiff_t)sizeof(float)));
-	return next;
-}
-
 /* Makes a pencil's profile, with CARE as leaning_add; what sides do is in the weights but for CARE_ALL at the ends. */
 template <pencil_care CARE>
 static __device__ __forceinline__ void upright_walk(const upright_pencil &p, const matched_run &run,
@@ -615,14 +603,14 @@ static __device__ __forceinline__ void upright_walk(const upright_pencil &p, con
 
 	if (p.count > 0) {
 #pragma unroll
-		for (int i = 0; i < UPRIGHT_AHEAD; i++, row = upright_next(row, p.step))
+		for (int i = 0; i < UPRIGHT_AHEAD; i++, row += p.step)
 			ahead[i] = *row;
 	}
 	for (int n = p.count; n > 0; n -= UPRIGHT_AHEAD) {
 		float next[UPRIGHT_AHEAD];
 
 #pragma unroll
-		for (int i = 0; i < UPRIGHT_AHEAD; i++, row = upright_next(row, p.step))
+		for (int i = 0; i < UPRIGHT_AHEAD; i++, row += p.step)
 			next[i] = *row;
 #pragma unroll
 		for (int i = 0; i < UPRIGHT_AHEAD; i++, r += p.sign) {

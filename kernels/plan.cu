@@ -14,7 +14,6 @@
 enum { LAYERS_MOST = 2048 };                      /* of a layered array, on every card */
 enum { SIDE_MOST = 32768 };                       /* its width and height */
 enum { BATCH_LEAN = 16 };                         /* of BATCH_MOST, with little memory */
-enum { SECONDS_VIEWS = 16 };                      /* from which on float slices have second differences */
 static const double SMALL = 1 << 20;              /* voxels times views below which launches take longer than samples */
 static const size_t RAW_BYTES = (size_t)16 << 20; /* of the buffer of raw samples, */
 enum { RAW_PART = 16 };                           /* and of all views at most the 16th part */
@@ -342,12 +341,6 @@ static int corrected_at_once(enum thrift thrift, int subset)
 	return lean_or(thrift, in_parts ? divide_up(subset, thrift - THRIFT_2_PARTS + 2) : subset);
 }
 
-/* Views that are projected in one go. */
-static int views_a_time(const struct plan_options *options, enum thrift thrift, int subset)
-{
-	return subset > 0 ? corrected_at_once(thrift, subset) : options->geometry->count;
-}
-
 static struct plan_shape shape_of(const struct plan_options *options, enum thrift thrift)
 {
 	const struct geometry *geometry = options->geometry;
@@ -363,9 +356,6 @@ static struct plan_shape shape_of(const struct plan_options *options, enum thrif
 	shape.matched = choose_matched(options, shape.z_rays);
 	/* The matched pair is in float: upright with the projection by rows, else with the general one. */
 	shape.halves = !options->reference_precision && !shape.is_small && !options->matched;
-	/* Second differences are laid out in twice the time, which few views do not bring back. */
-	shape.seconds =
-	    !shape.halves && !shape.is_small && views_a_time(options, thrift, shape.subset) >= SECONDS_VIEWS;
 	choose_rows(options, &shape);
 	if (shape.is_small)
 		shape.back_voxels = 0;
@@ -469,9 +459,7 @@ static void describe_scratch(struct plan *plan)
 	const struct plan_options *options = &plan->options;
 
 	if (!options->no_projection && !plan->shape.is_small)
-		plan->slices_bytes = (plan->shape.seconds ? 2 * at_least(plan->along_x.floats, plan->along_y.floats)
-							  : plan->along_x.floats + plan->along_y.floats) *
-				     sizeof(float);
+		plan->slices_bytes = (plan->along_x.floats + plan->along_y.floats) * sizeof(float);
 	if (plan->strategy != NULL)
 		plan->slices_bytes = at_least(plan->slices_bytes, plan->strategy->scratch_bytes(plan));
 	plan->scratch_bytes = at_least(plan->slices_bytes, tv_scratch_bytes(options));

@@ -1,10 +1,8 @@
 /*
  * Forward projection (rays.cuh has the method), all views of a call in one launch.
- * The volume is read as slices (layout.cu), in half precision as pairs of neighbours
- * along the row axis: one load brings two voxels and one instruction works on both.
- * In float, but for few views, a voxel comes with its second difference across (rays.cuh),
- * and the slices of one axis take the room of both: each axis' rays have their own launch.
- * What a ray sums up is in float.
+ * The volume is read as slices (layout.cu), in reference precision as floats, else
+ * as pairs of neighbours along the row axis in half precision: one load brings
+ * two voxels and one instruction works on both. What a ray sums up is in float.
  *
  * General: a thread has one ray and a warp 32 neighbours in a row, which walk the
  * slices of their axis together.
@@ -36,28 +34,9 @@ struct projection {
 	size_t slot;
 	bool rows_down;
 	const unsigned *most; /* the volume's, in half precision */
-	int axis;             /* whose rays are walked, or BOTH_AXES */
 	struct ray_use use;
 	float *to;
 };
-
-/* The axes of a launch: the one it has slices of, or both. */
-enum { BOTH_AXES = -1 };
-static __host__ __device__ constexpr int first_axis(int axis)
-{
-	return axis == BOTH_AXES ? ACROSS_X : axis;
-}
-static __host__ __device__ constexpr int last_axis(int axis)
-{
-	return axis == BOTH_AXES ? ACROSS_Y : axis;
-}
-
-/* Whether a launch finishes the rays of an axis; the last one has those along z too. */
-template <int AXIS>
-static __device__ __forceinline__ bool finishes(int own)
-{
-	return AXIS == BOTH_AXES || own == AXIS || (AXIS == ACROSS_Y && own == ACROSS_Z);
-}
 
 /* Factor that takes the volume's scale out of a sum over slices of T. */
 template <typename T>
@@ -112,34 +91,6 @@ static __device__ __forceinline__ float2 finish(const projection &p, int slot, i
 	return squares;
 }
 
-/* The block's part of the sums, to which the launch for the other axis adds. Every thread must come here. */
-template <int AXIS>
-static __device__ __forceinline__ void put_squares(const projection &p, float2 squares)
-{
-	if (p.use.measured == NULL)
-		return;
-	squares = block_sum(squares);
-	if (threadIdx.x != 0 || threadIdx.y != 0 || threadIdx.z != 0)
-		return;
-	if (AXIS == ACROSS_Y) {
-		const float2 before = p.use.partial[blockIdx.x];
-
-		squares = {before.x + squares.x, before.y + squares.y};
-	}
-	p.use.partial[blockIdx.x] = squares;
-}
-
-/* Whether a launch has nothing to do for a block of which no thread has a ray to finish, but to say so. */
-template <int AXIS>
-static __device__ __forceinline__ bool is_idle(const projection &p, bool ours)
-{
-	if (AXIS == BOTH_AXES || __syncthreads_or(ours))
-		return false;
-	if (AXIS == ACROSS_X && p.use.measured != NULL && threadIdx.x == 0 && threadIdx.y == 0 && threadIdx.z == 0)
-		p.use.partial[blockIdx.x] = {0, 0};
-	return true;
-}
-
 /*
  * Rows of a block, 32 columns wide, a warp a row, and its views: rays far apart share little among rows, but much with
  * the next views.
@@ -153,9 +104,9 @@ static const int GENERAL_BLOCKS = 5;
 #endif
 static const int FLOAT_BLOCKS = 4; /* in float: loads on their way need registers */
 
-template <typename T, bool ALONG_Z, int AXIS>
+template <typename T, bool ALONG_Z>
 static __global__ void __launch_bounds__(32 * GENERAL_ROWS * GENERAL_VIEWS,
-					 std::is_same<T, __half2>::value ? GENERAL_BLOCKS : FLOAT_BLOCKS)
+					 std::is_same<T, float>::value ? FLOAT_BLOCKS : GENERAL_BLOCKS)
     project_general(const projection p)
 {
 	place at = place_of<GENERAL_VIEWS>(p);
@@ -168,15 +119,12 @@ static __global__ void __launch_bounds__(32 * GENERAL_ROWS * GENERAL_VIEWS,
 	float d[3], m[3];
 	line_to(g, c, r, d, m);
 	int own = dominant_axis(d[0], d[1], d[2]);
-	valid = valid && finishes<AXIS>(own);
 	bool meets = valid && meets_grid(g, column, 1, row, 1);
 	float sum = 0, slices = 0, step = 0;
 
-	if (is_idle<AXIS>(p, valid))
-		return;
-#pragma unroll(AXIS == BOTH_AXES ? 1 : 2) /* a single axis is no loop, and needs fewer registers */
-	for (int axis = first_axis(AXIS); axis <= last_axis(AXIS); axis++) {
-		bool mine = meets && own == axis; /* warps near the diagonals have rays of both axes */
+	/* Warps near the diagonals hold rays of both axes: they walk twice. */
+	for (int axis = ACROSS_X; axis <= ACROSS_Y; axis++) {
+		bool mine = meets && own == axis;
 
 		if (!__any_sync(~0u, mine))
 			continue;
@@ -245,7 +193,11 @@ static __global__ void __launch_bounds__(32 * GENERAL_ROWS * GENERAL_VIEWS,
 	float2 squares = {0, 0};
 	if (valid)
 		squares = finish(p, at.slot, view, column, row, sum, slices, step);
-	put_squares<AXIS>(p, squares);
+	if (p.use.measured != NULL) {
+		squares = block_sum(squares);
+		if (threadIdx.x == 0 && threadIdx.y == 0 && threadIdx.z == 0)
+			p.use.partial[blockIdx.x] = squares;
+	}
 }
 
 /* ---- small problems ---- */
@@ -301,30 +253,21 @@ static __device__ __forceinline__ int first_column(float fast, int panel, float 
 }
 
 /* The samples of slice i in float. */
-template <neighbours KIND, int ROWS, int GUARD, typename T>
-static __device__ __forceinline__ void sample_rows(const T *__restrict__ slice, int panel, const fan &f,
+template <neighbours KIND, int ROWS, int GUARD>
+static __device__ __forceinline__ void sample_rows(const float *__restrict__ slice, int panel, const fan &f,
 						   const wandering &wander, float i, const slice_axes &axes,
 						   float value[ROWS])
 {
 	const int values = neighbours_values(KIND, ROWS);
 	float e = fmaf(i, f.spread_step, f.spread), right, t, x[values];
 	int low = lowest_row<KIND, ROWS, GUARD>(f, i, e, axes, t);
-	const T *q =
+	const float *q =
 	    slice + (low * PANEL + first_column(held<GUARD>(fmaf(i, f.fast_step, f.fast), axes), panel, right));
-
-	if constexpr (std::is_same<T, float2>::value) {
-		const kinks kink = kinks_at(wander, right);
+	four_parts four = parts_at(wander, right);
 
 #pragma unroll
-		for (int j = 0; j < values; j++)
-			x[j] = across_four(q + j * PANEL + 1, right, kink);
-	} else {
-		const four_parts four = parts_at(wander, right);
-
-#pragma unroll
-		for (int j = 0; j < values; j++)
-			x[j] = across_four(q + j * PANEL, 1, four);
-	}
+	for (int j = 0; j < values; j++)
+		x[j] = across_four(q + j * PANEL, 1, four);
 #pragma unroll
 	for (int k = 0; k < ROWS; k++) {
 		const int j = neighbours_begin(KIND, k);
@@ -335,8 +278,8 @@ static __device__ __forceinline__ void sample_rows(const T *__restrict__ slice, 
 	}
 }
 
-template <neighbours KIND, int ROWS, int GUARD, bool LEAN, typename T, typename Ends>
-static __device__ __forceinline__ void add_slices(const T *at, const slices &across, int from, int to, const fan &f,
+template <neighbours KIND, int ROWS, int GUARD, bool LEAN, typename Ends>
+static __device__ __forceinline__ void add_slices(const float *at, const slices &across, int from, int to, const fan &f,
 						  const wandering &wander, const slice_axes &axes, Ends &ends,
 						  float sum[ROWS])
 {
@@ -454,7 +397,7 @@ static __device__ __forceinline__ void add_apart(const __half2 *at, const slices
 	}
 }
 
-template <neighbours KIND, int ROWS, typename T, bool LEAN, bool APART, int AXIS>
+template <neighbours KIND, int ROWS, typename T, bool LEAN, bool APART>
 static __global__ void __launch_bounds__(32 * ROWS_WARPS * ROWS_VIEWS, 32 / (ROWS_WARPS * ROWS_VIEWS))
     project_rows(const projection p)
 {
@@ -470,14 +413,10 @@ static __global__ void __launch_bounds__(32 * ROWS_WARPS * ROWS_VIEWS, 32 / (ROW
 	float d[3], m[3];
 	line_to(g, c, r, d, m);
 	int own = fabsf(d[0]) >= fabsf(d[1]) ? ACROSS_X : ACROSS_Y;
-	valid = valid && finishes<AXIS>(own);
 	bool meets = meets_grid(g, at.tile_column * 32, 32, p.rows_down ? p.rows - low - ROWS : low, ROWS);
 	float2 squares = {0, 0};
 
-	if (is_idle<AXIS>(p, valid))
-		return;
-#pragma unroll(AXIS == BOTH_AXES ? 1 : 2)
-	for (int axis = first_axis(AXIS); axis <= last_axis(AXIS); axis++) {
+	for (int axis = ACROSS_X; axis <= ACROSS_Y; axis++) {
 		bool mine = valid && meets && own == axis;
 
 		if (!__any_sync(~0u, mine))
@@ -540,7 +479,11 @@ static __global__ void __launch_bounds__(32 * ROWS_WARPS * ROWS_VIEWS, 32 / (ROW
 		squares.x += square.x;
 		squares.y += square.y;
 	}
-	put_squares<AXIS>(p, squares);
+	if (p.use.measured != NULL) {
+		squares = block_sum(squares);
+		if (threadIdx.x == 0 && threadIdx.y == 0 && threadIdx.z == 0)
+			p.use.partial[blockIdx.x] = squares;
+	}
 }
 
 template <neighbours KIND, int ROWS>
@@ -548,16 +491,12 @@ static void launch_neighbours(const plan_shape &shape, const projection &p, unsi
 {
 	dim3 threads(32, ROWS_WARPS, ROWS_VIEWS);
 
-	if (p.axis == ACROSS_X)
-		project_rows<KIND, ROWS, float2, false, false, ACROSS_X><<<blocks, threads, 0, stream>>>(p);
-	else if (p.axis == ACROSS_Y)
-		project_rows<KIND, ROWS, float2, false, false, ACROSS_Y><<<blocks, threads, 0, stream>>>(p);
-	else if (!shape.halves)
-		project_rows<KIND, ROWS, float, false, false, BOTH_AXES><<<blocks, threads, 0, stream>>>(p);
+	if (!shape.halves)
+		project_rows<KIND, ROWS, float, false, false><<<blocks, threads, 0, stream>>>(p);
 	else if (shape.untilted)
-		project_rows<KIND, ROWS, __half2, false, false, BOTH_AXES><<<blocks, threads, 0, stream>>>(p);
+		project_rows<KIND, ROWS, __half2, false, false><<<blocks, threads, 0, stream>>>(p);
 	else
-		project_rows<KIND, ROWS, __half2, true, false, BOTH_AXES><<<blocks, threads, 0, stream>>>(p);
+		project_rows<KIND, ROWS, __half2, true, false><<<blocks, threads, 0, stream>>>(p);
 }
 
 static void launch_rows(const struct plan *plan, const projection &p, unsigned blocks)
@@ -585,11 +524,9 @@ static void launch_apart(const struct plan *plan, const projection &p, unsigned 
 	cudaStream_t stream = plan->device->stream;
 
 	if (plan->shape.untilted)
-		project_rows<NEIGHBOURS_EVEN, ROWS_APART, __half2, false, true, BOTH_AXES>
-		    <<<blocks, threads, 0, stream>>>(p);
+		project_rows<NEIGHBOURS_EVEN, ROWS_APART, __half2, false, true><<<blocks, threads, 0, stream>>>(p);
 	else
-		project_rows<NEIGHBOURS_EVEN, ROWS_APART, __half2, true, true, BOTH_AXES>
-		    <<<blocks, threads, 0, stream>>>(p);
+		project_rows<NEIGHBOURS_EVEN, ROWS_APART, __half2, true, true><<<blocks, threads, 0, stream>>>(p);
 }
 
 /* Cut once only where all of it would not run at one time. */
@@ -601,28 +538,16 @@ static void launch_small(const struct plan *plan, const projection &p, unsigned 
 	project_small<<<blocks, dim3(SMALL_PIXELS, many ? SMALL_PARTS / 2 : SMALL_PARTS), 0, device->stream>>>(p);
 }
 
-template <typename T, int AXIS>
-static void launch_single(const struct plan *plan, const projection &p, unsigned blocks)
+template <typename T>
+static void launch_general(const struct plan *plan, const projection &p, unsigned blocks)
 {
 	dim3 threads(32, GENERAL_ROWS, GENERAL_VIEWS);
 	cudaStream_t stream = plan->device->stream;
 
 	if (plan->shape.z_rays)
-		project_general<T, true, AXIS><<<blocks, threads, 0, stream>>>(p);
+		project_general<T, true><<<blocks, threads, 0, stream>>>(p);
 	else
-		project_general<T, false, AXIS><<<blocks, threads, 0, stream>>>(p);
-}
-
-static void launch_general(const struct plan *plan, const projection &p, unsigned blocks)
-{
-	if (p.axis == ACROSS_X)
-		launch_single<float2, ACROSS_X>(plan, p, blocks);
-	else if (p.axis == ACROSS_Y)
-		launch_single<float2, ACROSS_Y>(plan, p, blocks);
-	else if (plan->shape.halves)
-		launch_single<__half2, BOTH_AXES>(plan, p, blocks);
-	else
-		launch_single<float, BOTH_AXES>(plan, p, blocks);
+		project_general<T, false><<<blocks, threads, 0, stream>>>(p);
 }
 
 /* ---- the table ---- */
@@ -662,8 +587,8 @@ static const struct projector projectors[] = {
     {"small", is_small, SMALL_WARPS, 1, launch_small},
     {"rows apart", is_apart, ROWS_WARPS, ROWS_VIEWS, launch_apart},
     {"by rows", is_by_rows, ROWS_WARPS, ROWS_VIEWS, launch_rows},
-    {"general, half precision", is_in_halves, GENERAL_ROWS, GENERAL_VIEWS, launch_general},
-    {"general", is_any, GENERAL_ROWS, GENERAL_VIEWS, launch_general},
+    {"general, half precision", is_in_halves, GENERAL_ROWS, GENERAL_VIEWS, launch_general<__half2>},
+    {"general", is_any, GENERAL_ROWS, GENERAL_VIEWS, launch_general<float>},
 };
 
 static const struct projector *projector_of(const struct plan *plan)
@@ -701,14 +626,6 @@ size_t project_blocks(const struct plan *plan, int count)
 	return (size_t)tiles * (size_t)divide_up(count, projector_of(plan)->views);
 }
 
-static int launch_axis(const struct plan *plan, projection p, int axis, struct error *err)
-{
-	p.axis = axis;
-	projector_of(plan)->launch(plan, p, (unsigned)project_blocks(plan, p.count));
-	LAUNCHED();
-	return 0;
-}
-
 int project_rays(struct plan *plan, const float *volume, int first, int count, struct ray_use use, float *to,
 		 struct error *err)
 {
@@ -719,8 +636,8 @@ int project_rays(struct plan *plan, const float *volume, int first, int count, s
 	p.count = count;
 	count_tiles(plan, &p.tiles_across, &p.tiles);
 	p.grid = plan->grid;
-	p.across[0] = layout_across(plan, ACROSS_X);
-	p.across[1] = layout_across(plan, ACROSS_Y);
+	p.across[0] = slices_at(plan->scratch, &plan->along_x);
+	p.across[1] = slices_at(plan->scratch + plan->along_x.floats, &plan->along_y);
 	p.volume = volume;
 	p.columns = plan->stack.columns;
 	p.rows = plan->stack.rows;
@@ -730,19 +647,14 @@ int project_rays(struct plan *plan, const float *volume, int first, int count, s
 	p.most = plan->most + MOST_VOLUME;
 	p.use = use;
 	p.to = to;
-	if (!plan->shape.seconds)
-		return launch_axis(plan, p, BOTH_AXES, err);
-	for (int axis = ACROSS_X; axis <= ACROSS_Y; axis++) {
-		TRY(layout_seconds(plan, volume, axis, err));
-		TRY(launch_axis(plan, p, axis, err));
-	}
+	projector_of(plan)->launch(plan, p, (unsigned)project_blocks(plan, count));
+	LAUNCHED();
 	return 0;
 }
 
 int project_prepare(struct plan *plan, const float *volume, struct error *err)
 {
-	/* With second differences slices are laid out for one axis after the other, before its rays. */
-	return plan->shape.is_small || plan->shape.seconds ? 0 : layout_slices(plan, volume, err);
+	return plan->shape.is_small ? 0 : layout_slices(plan, volume, err);
 }
 
 int cuda_project(struct plan *plan, const struct volume *from, const int *views, int count, struct stack *to,

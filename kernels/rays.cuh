@@ -17,9 +17,6 @@
  * the columns j - 1 .. j + 2 beside the position j + right count with k0,
  * 1 - right - 2 k0 + k1, right + k0 - 2 k1 and k1, k0 = kink(right) and
  * k1 = kink(1 - right). Along the row axis it stays linear at the middle.
- *
- * The same is the linear interpolation of the two in the middle, k0 of the second difference at j, and k1 of that at
- * j + 1: where slices hold each voxel with its second difference, two columns are read in place of four.
  */
 #include <cuda_fp16.h>
 
@@ -370,34 +367,7 @@ static __device__ __forceinline__ float sample_ray(const __half2 *__restrict__ s
 	return mix(one.x, one.y, up);
 }
 
-/* One row of the four columns, from the two in the middle with their second differences, from p on. */
-static __device__ __forceinline__ float across_four(const float2 *__restrict__ p, float right, const kinks &kink)
-{
-	const float2 a = p[0], b = p[1];
-
-	return fmaf(kink.k1, b.y, fmaf(kink.k0, a.y, mix(a.x, b.x, right)));
-}
-
-/* The sample of one slice of floats with their second differences, which begins `from` behind the pointer. */
-static __device__ __forceinline__ float sample_ray(const float2 *__restrict__ slice, int row_stride, float fast,
-						   float row, const wandering &wander, unsigned from = 0)
-{
-	float right, up;
-	unsigned i = split_bits(fast, right), j = split_bits(row, up);
-	unsigned surplus = SPLIT_BITS * (unsigned)row_stride + SPLIT_BITS - from;
-	const float2 *p = slice + (int)(j * (unsigned)row_stride + (i - surplus));
-	const kinks kink = kinks_at(wander, right);
-
-	return mix(across_four(p, right, kink), across_four(p + row_stride, right, kink), up);
-}
-static __device__ __forceinline__ float sample_two(const float2 *__restrict__ slice, size_t next, int row_stride,
-						   const float fast[2], const float row[2], const wandering &wander)
-{
-	return sample_ray(slice, row_stride, fast[0], row[0], wander) +
-	       sample_ray(slice, row_stride, fast[1], row[1], wander, (unsigned)next);
-}
-
-/* The same of floats alone. */
+/* The same of floats. */
 static __device__ __forceinline__ float sample_ray(const float *__restrict__ slice, int row_stride, float fast,
 						   float row, const wandering &wander)
 {
