@@ -445,6 +445,7 @@ enum agreement_grade agreement_grade(const struct agreement *agreement, double b
 	    (agreement_is_known(agreement) && agreement->unexplained > UNEXPLAINED && !agreement->cut))
 		return AGREEMENT_WRONG;
 	if (!agreement_is_known(agreement) || agreement->mm < least * bin || raw < BEYOND_SIGMA * agreement->sigma_mm ||
+	    opposite_rays_against_shifts(&agreement->rays) ||
 	    (agreement->firm < (agreement->cut ? FIRM_CUT : FIRM) && !opposite_rays_shifted(&agreement->rays)))
 		return AGREEMENT_GOOD;
 	return agreement->mm < WRONG * bin ? AGREEMENT_DOUBTFUL : AGREEMENT_WRONG;

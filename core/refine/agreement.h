@@ -28,7 +28,8 @@
  *
  * A body that the detector cuts off, or a plate whose faces lie along the rays, moves a part of a view against its
  * reprojection and not the rest. Therefore a shift counts where the view without any quarter or half of its columns or
- * rows still says it, or where the rays that opposite views share agree better with the views moved by it.
+ * rows still says it, or where the rays that opposite views share agree better with the views moved by it. Edges that
+ * are finer than the bins move a view as a whole; a shift with which these rays agree worse by far does not count.
  *
  * Large departures of all views, an arm that turned the other way and a detector far aside, are told by the rays that
  * opposite views have in common (opposite.h), which need no volume. Of scans of 32 to 63 views nothing else is asked.

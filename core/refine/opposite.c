@@ -16,6 +16,11 @@ static const double SMALLER = 4, NEARLY = 2, FAR_SMALLER = 8;
 /* The same where views lie aside as well, by all and by each of the shifts found: what fits was at most 1.2
  * and .8 times better. */
 static const double NEAR_SMALLER = 3, SHIFTED_SMALLER = 1.25, NEITHER[2] = {0};
+/*
+ * Times by which they are larger where the shifts are none of the views': 2.3 to 650 where bins are too coarse for
+ * edges (two of twelve such scans: 1.7 and 1.9); where views do lie aside it was 1.5 at most.
+ */
+static const double SHIFTED_LARGER = 2;
 /* The share of the integrals below which differences come from the bins' width, and say nothing. */
 static const double SHARE_LEAST = 0.005;
 /* Differences of integrals that have nothing to do with each other are twice their mean square. */
@@ -262,4 +267,9 @@ bool opposite_rays_shifted(const struct opposite_rays *rays)
 {
 	return rays->noticed && is_given_shown(rays) &&
 	       SHIFTED_SMALLER * rays->shifted_share < rays->share[OPPOSITE_GIVEN];
+}
+
+bool opposite_rays_against_shifts(const struct opposite_rays *rays)
+{
+	return is_given_shown(rays) && rays->shifted_share > SHIFTED_LARGER * rays->share[OPPOSITE_GIVEN];
 }

@@ -56,5 +56,7 @@ bool opposite_rays_aside(const struct opposite_rays *rays);
 bool opposite_rays_near_aside(const struct opposite_rays *rays);
 /* True if the views moved by their shifts agree better than as they are. */
 bool opposite_rays_shifted(const struct opposite_rays *rays);
+/* True if they agree worse by far: the views do not lie aside. */
+bool opposite_rays_against_shifts(const struct opposite_rays *rays);
 
 #endif

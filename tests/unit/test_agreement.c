@@ -327,6 +327,49 @@ START_TEST(a_ball_beside_the_axis_accuses_no_displaced_detector)
 }
 END_TEST
 
+static const struct {
+	double radius, first, arc; /* mm, degrees */
+} small_balls[] = {{9, 0, 200}, {9, 0, 240}, {12, 90, 210}, {12, 0, 240}};
+
+/*
+ * Edges that fall between the bins' middles lie aside of their reprojection in all parts of a view. The rays that
+ * opposite views share contradict.
+ */
+START_TEST(a_small_ball_whose_edges_are_finer_than_the_bins_is_not_doubted)
+{
+	const double radius = small_balls[_i].radius;
+	const struct arm arm = {.columns = 64,
+				.rows = 48,
+				.count = 64,
+				.pixel = 4,
+				.first = small_balls[_i].first * M_PI / 180,
+				.step = small_balls[_i].arc * M_PI / 180 / 63};
+	struct ellipsoid ball = {
+	    .shape = SHAPE_ELLIPSOID, .semi_axes = {radius, radius, radius}, .centre = {20, 10, 5}, .density = .02};
+	float projections[64 * 64 * 48];
+	struct geometry said = circle_of(&arm), taken = circle_of(&arm);
+
+	for (int aside = 0; aside < 2; aside++) {
+		struct figures figures;
+		enum agreement_grade grade;
+
+		for (int k = 0; k < arm.count; k++) {
+			for (int a = 0; a < 3 && aside; a++)
+				taken.views[k].pixel0[a] += 3 / arm.pixel * taken.views[k].column_step[a];
+			phantom_project(&(struct phantom){.count = 1, .parts = &ball}, &taken, k,
+					projections + (size_t)k * 64 * 48);
+		}
+		figures = check(&said, projections, false, -1);
+		grade = agreement_grade(&figures.agreement, figures.bin);
+		ck_assert_msg(grade == (aside ? AGREEMENT_WRONG : AGREEMENT_GOOD), "aside %d: grade %d, %.3f mm", aside,
+			      (int)grade, figures.agreement.mm);
+		agreement_clear(&figures.agreement);
+	}
+	geometry_clear(&said);
+	geometry_clear(&taken);
+}
+END_TEST
+
 /* A ball on the axis looks the same either way: nothing can be known, and nothing is said. */
 START_TEST(a_ball_on_the_axis_turns_either_way)
 {
@@ -654,6 +697,7 @@ Suite *agreement_suite(void)
 	tcase_add_loop_test(known, an_arm_that_turned_the_other_way_is_told, 0, 2 * KINDS);
 	tcase_add_loop_test(known, a_displaced_detector_is_told_from_one_on_the_other_side, 0, 3);
 	tcase_add_loop_test(known, a_ball_beside_the_axis_accuses_no_displaced_detector, 0, 2);
+	tcase_add_loop_test(known, a_small_ball_whose_edges_are_finer_than_the_bins_is_not_doubted, 0, 4);
 	tcase_add_test(known, a_ball_on_the_axis_turns_either_way);
 	tcase_add_loop_test(known, a_truncated_head_is_accused_of_no_more_than_is_wrong, 0,
 			    (int)(sizeof(cuts) / sizeof(cuts[0])));
