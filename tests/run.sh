@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # Every test: the house's rules, the unit tests and the black-box tests over HTTP, JOBS parts at a time: three more than
 # there are processors, since most of those over HTTP wait four fifths of their time. Unit suites compute, so that they
-# have one place for each processor; when there is none left, others have those places too. What cannot run here is
+# have one place for each processor; when there is none left, others have five places for each. What cannot run here is
 # skipped aloud. Closes with `N passed, N failed, N skipped`.
 # Usage: tests/run.sh [--soak] [FILTER ...]   only the parts whose path has one of the words in it; --soak: the long
 # tests of tests/soak in place of all others
@@ -11,7 +11,7 @@ export BUILD=${BUILD:-build}
 # Parts share the processors: threads that wait for others of theirs leave them to the rest, at once.
 export OMP_WAIT_POLICY=${OMP_WAIT_POLICY:-passive}
 processors=$(nproc)
-places_without_suites=${JOBS:-$((2 * processors + 3))}
+places_without_suites=${JOBS:-$((5 * processors))}
 JOBS=${JOBS:-$((processors + 3))}
 out=$BUILD/test/parts
 rm -rf "$BUILD"/test/{exchanges,reported.*,parts}
@@ -26,8 +26,10 @@ if [ "${1:-}" = --soak ]; then
 	parts=(tests/soak/test_*.sh)
 	places_without_suites=$JOBS
 else
-	parts=(tests/http/test_real.sh tests/http/test_fleet.sh tests/http/test_restart.sh unit/recon unit/backend unit/outofcore tests/web/test_page.sh
-		unit/study tests/http/test_supervise.sh unit/exterior tests/http/test_arriving.sh lint)
+	parts=(tests/http/test_fleet.sh tests/http/test_restart.sh unit/recon unit/exterior tests/http/test_devices_of_a_job.sh
+		unit/study tests/web/test_page.sh unit/outofcore tests/http/test_job.sh tests/http/test_faulty_device.sh unit/metal
+		tests/http/test_real.sh unit/backend tests/http/test_supervise.sh tests/http/test_fleet_network.sh
+		tests/http/test_arriving.sh tests/http/test_metal.sh tests/http/test_phantom.sh lint)
 	rest=$("$BUILD/unit" --list | sed 's,^,unit/,') || exit 1
 	for part in $rest tests/http/test_*.sh tests/web/test_*.sh; do
 		[[ " ${parts[*]} " == *" $part "* ]] || parts+=("$part")
