@@ -690,7 +690,7 @@ START_TEST(the_same_bits_with_other_threads_after_a_yield_and_in_just_the_memory
 	const int scan = _i == 2 ? 2 : 6;
 	struct grid grid = is_wide ? grid_of_wide(scan) : grid_between(75, 75, 5);
 	struct recipe recipe = sart_on(&grid);
-	struct outcome whole = {.threads = 1}, first = {.threads = 2, .yield_at = 2}, second = {.threads = 2};
+	struct outcome whole = {.threads = 1}, first = {.threads = 2, .yield_at = 1}, second = {.threads = 2};
 	struct recon_memory memory;
 	struct scene scene = {0};
 	struct device *device;
@@ -700,7 +700,7 @@ START_TEST(the_same_bits_with_other_threads_after_a_yield_and_in_just_the_memory
 		scan_of_wide(&scene, scan);
 	else
 		scan_of(&scene, CIRCLE, &trunk);
-	recipe.iterate.iterations = 3;
+	recipe.iterate.iterations = 2;
 	recipe.projector = _i == 1 ? PROJECTOR_MATCHED : PROJECTOR_INTERPOLATING;
 	run(&scene, &recipe, &whole);
 	scene_run(&scene, &recipe, &first);

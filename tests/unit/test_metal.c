@@ -410,18 +410,24 @@ static struct beside beside_metal(const float *volume, const float *clean, const
 
 		for (int a = 0; a < 3; a++)
 			place[a] = grid->origin[a] + at[a] * grid->spacing[a];
+		if (fabs(place[2]) > 9 || hypot(place[0] / 56, place[1] / 44) > 1)
+			continue;
 		/* How far the shapes must grow to reach it: near enough to the distance for thin ones. */
 		for (int k = 0; k < object->count; k++) {
-			struct ellipsoid grown = object->parts[k];
-			const struct phantom one = {1, &grown};
+			struct ellipsoid grown = object->parts[k], largest = grown;
+			const struct phantom one = {1, &grown}, all = {1, &largest};
 			double mm = 0;
 
+			for (int a = 0; a < 3; a++)
+				largest.semi_axes[a] += farthest;
+			if (phantom_density(&all, place) == 0)
+				continue;
 			for (; mm < farthest && phantom_density(&one, place) == 0; mm += .4)
 				for (int a = 0; a < 3; a++)
 					grown.semi_axes[a] += .4;
 			away = fmin(away, mm);
 		}
-		if (away < nearest || away >= farthest || fabs(place[2]) > 9 || hypot(place[0] / 56, place[1] / 44) > 1)
+		if (away < nearest || away >= farthest)
 			continue;
 		squares += error * error;
 		count++;
