@@ -245,10 +245,10 @@ $(BUILD)/agreement: $(call objects,tests/bench/agreement.c tests/bench/bodies.c 
 	$(call say,LINK)$(CC) $(LDFLAGS) -o $@ $^ $(call pkg,--libs,$(core_libs)) $(LIBM)
 
 # What the refinement makes of such scans.
-$(BUILD)/refine: $(call objects,tests/bench/refine.c tests/bench/bodies.c tests/unit/arm.c) $(core_objects) $(cuda_objects)
+$(BUILD)/refine: $(call objects,tests/bench/refine.c tests/bench/fdk_volume.c tests/bench/bodies.c tests/unit/arm.c) $(core_objects) $(cuda_objects)
 	$(call say,LINK)$(CC) $(LDFLAGS) -o $@ $^ $(call pkg,--libs,$(core_libs)) $(if $(cuda_objects),$(cuda_libs)) $(LIBM)
 
-$(BUILD)/calibrate-bench: $(call objects,tests/bench/calibrate.c tests/unit/arm.c) $(library)
+$(BUILD)/calibrate-bench: $(call objects,tests/bench/calibrate.c tests/bench/fdk_volume.c tests/unit/arm.c) $(library)
 	$(call say,LINK)$(CC) $(LDFLAGS) -o $@ $^ $(call pkg,--libs,$(core_libs)) $(LIBM)
 
 # Claims of many workers at once in the ledger of a fleet.

@@ -19,10 +19,10 @@
 #include <omp.h>
 #endif
 
-#include "core/fdk.h"
 #include "core/fit/least_squares.h"
 #include "core/refine/refine.h"
 #include "tests/bench/bodies.h"
+#include "tests/bench/fdk_volume.h"
 #include "tests/unit/arm.h"
 
 enum { POINTS = 18, STRIDE = 3 };
@@ -174,58 +174,6 @@ static int compare(const struct geometry *truth, const struct geometry *said, do
 
 /* ---- the volume's error ---- */
 
-static int fdk_volume(const struct backend *backend, const struct geometry *geometry, const float *projections,
-		      const struct grid *grid, float *ret, struct error *err)
-{
-	struct orbit orbit = {0};
-	struct fdk_weights weights = {0};
-	struct device *device = NULL;
-	struct plan *plan = NULL;
-	struct fdk fdk = {0};
-	struct stack *stack = NULL;
-	struct volume *volume = NULL;
-	struct plan_options options = {.geometry = geometry, .grid = grid, .no_samples = true, .no_projection = true};
-	int code = orbit_analyse(&orbit, geometry, err);
-
-	if (code == 0)
-		code = fdk_weights_make(&weights, &orbit, geometry, WINDOW_HANN, 1, true, err);
-	options.column_weights = weights.columns;
-	options.filter_response = weights.response;
-	memcpy(options.pad, weights.pad, sizeof(options.pad));
-	memcpy(options.axis, weights.axis, sizeof(options.axis));
-	options.extend = weights.extend;
-	options.extended_response = weights.extended;
-	options.linearise.sample = SAMPLE_FLOAT32;
-	if (code == 0)
-		code = backend->open(0, &(struct device_options){0}, &device, err);
-	if (code == 0)
-		code = backend->plan_new(device, &options, &plan, err);
-	if (code == 0)
-		code = fdk_open(&fdk, backend, device, plan, geometry, weights.pad, err);
-	if (code == 0)
-		code = backend->stack_new(device, geometry->columns, geometry->rows, geometry->count, &stack, err);
-	if (code == 0)
-		code = backend->volume_new(device, grid, &volume, err);
-	if (code == 0)
-		code = backend->stack_upload(stack, 0, geometry->count, projections, err);
-	if (code == 0)
-		code = backend->volume_fill(volume, 0, err);
-	for (int k = 0; k < geometry->count && code == 0; k++)
-		code = fdk_add(&fdk, k, k, stack, volume, err);
-	if (code == 0)
-		code = fdk_flush(&fdk, stack, volume, err);
-	if (code == 0)
-		code = backend->volume_download(volume, 0, grid->size[2], ret, err);
-	backend->volume_free(volume);
-	backend->stack_free(stack);
-	fdk_clear(&fdk);
-	backend->plan_free(plan);
-	backend->close(device);
-	fdk_weights_clear(&weights);
-	orbit_clear(&orbit);
-	return code;
-}
-
 /* HU, within the body but for its metal, in every other voxel along each axis. */
 static int body_error(const struct backend *backend, const struct scan *scan, const struct geometry *geometry,
 		      const double motion[PATH_NUMBERS], int voxels, double *ret_hu, struct error *err)
@@ -248,7 +196,7 @@ static int body_error(const struct backend *backend, const struct scan *scan, co
 	for (int k = 0; k < geometry->count && code == 0; k++)
 		moved.views[k] = view_of_moved(&geometry->views[k], motion);
 	if (code == 0)
-		code = fdk_volume(backend, &moved, scan->projections, &grid, volume, err);
+		code = fdk_volume(backend, &moved, WINDOW_HANN, scan->projections, &grid, volume, err);
 #pragma omp parallel for reduction(+ : squares, count) schedule(dynamic)
 	for (int z = 2; z < grid.size[2] - 2; z += 2)
 		for (int y = 0; y < grid.size[1]; y += 2)

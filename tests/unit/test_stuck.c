@@ -608,6 +608,91 @@ START_TEST(an_object_is_no_error_of_gain)
 }
 END_TEST
 
+/* Full width at half maximum of the one wire in FDK's volume: the mean along x and y, mm. */
+static double width_of_wire(const struct scene *scene, const double at[3])
+{
+	enum { SIDE = 41 };
+	const double spacing = .1;
+	struct recipe recipe;
+	struct outcome outcome = {0};
+	struct grid grid = grid_of(SIDE, SIDE, 1, spacing, spacing, spacing);
+	const float *slice;
+	double width = 0;
+	int peak = 0;
+
+	for (int a = 0; a < 3; a++)
+		grid.origin[a] = at[a] - grid.size[a] / 2 * spacing;
+	recipe = recipe_on(&grid);
+	recipe.fdk.on = true;
+	run(scene, &recipe, &outcome);
+	slice = outcome_volume(&outcome, "final");
+	for (int i = 0; i < SIDE * SIDE; i++)
+		peak = slice[i] > slice[peak] ? i : peak;
+	for (int axis = 0; axis < 2; axis++)
+		for (int way = -1; way <= 1; way += 2) {
+			const int stride = way * (axis == 0 ? 1 : SIDE);
+			const float half = slice[peak] / 2;
+			int i = peak;
+
+			while (slice[i] > half) {
+				ck_assert(i + stride >= 0 && i + stride < SIDE * SIDE);
+				i += stride;
+			}
+			width += spacing / 2 *
+				 ((double)(i - peak) / stride -
+				  (double)((half - slice[i]) / (slice[i - stride] - slice[i])));
+		}
+	outcome_clear(&outcome);
+	return width;
+}
+
+/* Behind the mending of errors, or of none, a wire is as wide as without errors, within a per cent. */
+START_TEST(a_wire_stays_as_thin_as_it_is)
+{
+	static const double at[3] = {21, 6, 0};
+	struct ellipsoid parts[] = {
+	    {.shape = SHAPE_CYLINDER, .semi_axes = {40, 34, 200}, .density = .02},
+	    {.shape = SHAPE_CYLINDER, .semi_axes = {.4, .4, 20}, .centre = {at[0], at[1], at[2]}, .density = .5},
+	};
+	const struct phantom phantom = {.count = 2, .parts = parts};
+	const struct orbit_spec spec = {
+	    DRIFT_COLUMNS, DRIFT_ROWS / 4, 240, {620, 1100, {.75, .75}, {0, 0}, {0, 0}}, 0, 1.5};
+	const struct linearise linearise = {.sample = SAMPLE_FLOAT32, .quantity = QUANTITY_LINE_INTEGRAL};
+	const size_t pixels = DRIFT_PIXELS / 4;
+	float *errors = malloc(pixels * sizeof(*errors));
+	struct drifted drifted;
+	const struct rings_source source = {read_rows, &drifted};
+	struct rings_found found;
+	struct scene scene;
+	struct error err;
+	double before, after;
+	size_t wrong = 0;
+
+	even_state = 11;
+	scene_orbit(&scene, &spec);
+	scene_add(&scene, &phantom);
+	before = width_of_wire(&scene, at);
+	for (size_t i = 0; i < pixels && _i == 1; i++) {
+		const float error = even() < .005 ? -logf(even() < .5 ? 1.01f : .99f) : 0;
+
+		wrong += error != 0;
+		for (int view = 0; view < spec.views; view++)
+			scene.projections[(size_t)view * pixels + i] += error;
+	}
+	drifted = (struct drifted){.geometry = &scene.geometry, .samples = scene.projections};
+	ck_assert_int_eq(rings_find(&linearise, &scene.geometry, &source, NULL, errors, &found, &err), 0);
+	if (_i == 1)
+		ck_assert_uint_gt(3 * found.pixels, 2 * wrong);
+	for (size_t i = 0; i < pixels * (size_t)spec.views; i++)
+		scene.projections[i] -= errors[i % pixels];
+	after = width_of_wire(&scene, at);
+	ck_assert_msg(fabs(after / before - 1) < .01, "%.4f mm, mended %.4f mm, %zu pixels", before, after,
+		      found.pixels);
+	free(errors);
+	scene_clear(&scene);
+}
+END_TEST
+
 START_TEST(a_view_that_cannot_be_read_is_told)
 {
 	const struct orbit_spec spec = {COLUMNS, ROWS, VIEWS, {620, 1100, {2, 2}, {0, 0}, {0, 0}}, 0, 360. / VIEWS};
@@ -634,7 +719,7 @@ END_TEST
 Suite *stuck_suite(void)
 {
 	Suite *suite = suite_create("stuck");
-	TCase *tests = tcase_create("tests");
+	TCase *tests = tcase_create("tests"), *wires = tcase_create("wires");
 
 	tcase_set_timeout(tests, 0);
 	tcase_add_loop_test(tests, an_object_is_no_stuck_pixel, 0, 4);
@@ -649,5 +734,8 @@ Suite *stuck_suite(void)
 	tcase_add_loop_test(tests, an_object_is_no_error_of_gain, 0, 2);
 	tcase_add_test(tests, a_view_that_cannot_be_read_is_told);
 	suite_add_tcase(suite, tests);
+	tcase_set_timeout(wires, 0);
+	tcase_add_loop_test(wires, a_wire_stays_as_thin_as_it_is, 0, 2);
+	suite_add_tcase(suite, wires);
 	return suite;
 }
