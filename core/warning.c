@@ -154,7 +154,7 @@ const struct warning_kind warning_kinds[] = {
      "The image's voxels are coarser than what the projections show, which was smoothed to fit them; smaller voxels "
      "would show more."},
     {"rays_left_out", SEVERITY_INFO,
-     "There is something very dense in the image, such as metal: expect streaks around it."},
+     "There is something very dense in the image, metal or as dense as that: expect streaks around it."},
     {"iterations_settled", SEVERITY_INFO,
      "The projections show more than the image can hold, finer detail or a part of the patient beyond the detector, so "
      "that later iterations change it less."},

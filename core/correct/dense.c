@@ -15,13 +15,19 @@
 #include "core/correct/correction.h"
 #include "core/correct/metal.h"
 
-/* Times water's attenuation; cortical bone has up to 2.2. */
-static const double DENSE = 2.9;
+/* Times water's attenuation; cortical bone has up to 3.0. */
+static const double DENSE = 3.1;
 /*
  * An object that is dense itself, with more than this share of dense voxels among those of half of water and more,
  * keeps its rays: without them iterations would be left with nothing.
  */
 static const double FEW = 0.1, OBJECT = 0.5;
+/*
+ * What more than this share of all rays pass is bone, such as a skull, and keeps its rays too, unless its dense voxels
+ * have SURELY times water's attenuation in the mean: iterations mend what FDK has of bone, and metal seldom has as
+ * little.
+ */
+static const double RAYS_MOST = 0.2, SURELY = 3.7;
 enum { SLOTS = 4 }; /* that views are projected in */
 
 static bool wanted(const struct recipe *recipe, const struct linearise *linearise)
@@ -97,30 +103,36 @@ static int has_any(const struct correction_job *job, double least, bool *ret_any
 	return code;
 }
 
-/* True where dense voxels are few beside those of the object. */
-static int are_few(const struct correction_job *job, double least, bool *ret_few, struct error *err)
+/* True where dense voxels are few beside those of the object; ret_mean: of theirs, 1/mm. */
+static int are_few(const struct correction_job *job, double least, bool *ret_few, double *ret_mean, struct error *err)
 {
 	const struct grid *grid = &job->recipe->grid;
 	const size_t slice = (size_t)grid->size[0] * (size_t)grid->size[1];
 	const float body = (float)(OBJECT * job->recipe->mu_water), dense = (float)least;
 	float *values = malloc(slice * sizeof(*values));
 	size_t object = 0, found = 0;
+	double sum = 0;
 	int code = values != NULL ? 0 : error_set(err, ERR_NO_MEMORY, "no memory for a slice of %zu voxels", slice);
 
 	for (int z = 0; z < grid->size[2] && code == 0; z++) {
 		code = job->backend->volume_download(job->volume, z, 1, values, err);
 		for (size_t i = 0; i < slice && code == 0; i++) {
 			object += values[i] >= body;
-			found += values[i] >= dense;
+			if (values[i] >= dense) {
+				found++;
+				sum += (double)values[i];
+			}
 		}
 	}
 	free(values);
-	if (code == 0)
-		*ret_few = (double)found <= FEW * (double)object;
-	return code;
+	if (code != 0)
+		return code;
+	*ret_few = (double)found <= FEW * (double)object;
+	*ret_mean = found > 0 ? sum / (double)found : 0;
+	return 0;
 }
 
-static int find(const struct correction_job *job, struct metal *dense, struct error *err)
+static int find(const struct correction_job *job, struct metal *dense, double *ret_mean, struct error *err)
 {
 	const struct metal_tools tools = metal_tools_of(job);
 	const double least = DENSE * job->recipe->mu_water;
@@ -128,24 +140,30 @@ static int find(const struct correction_job *job, struct metal *dense, struct er
 	int code = has_any(job, least, &does, err);
 
 	if (code == 0 && does)
-		code = are_few(job, least, &does, err);
+		code = are_few(job, least, &does, ret_mean, err);
 	return code == 0 && does ? metal_find(dense, &tools, job->volume, least, err) : code;
+}
+
+/* Of all rays, those that pass what is dense. */
+static double share_of(const struct correction_job *job, const struct metal *dense)
+{
+	const struct geometry *geometry = job->geometry;
+
+	return (double)dense->replaced / ((double)geometry->count * (double)geometry->columns * (double)geometry->rows);
 }
 
 static int leave_out(const struct correction_job *job, struct metal *dense, struct error *err)
 {
-	const struct geometry *geometry = job->geometry;
-	const double rays = (double)geometry->count * (double)geometry->columns * (double)geometry->rows;
 	struct metal_tools tools = metal_tools_of(job);
 
 	if (dense->traces_count == 0)
 		return 0;
-	tools.slots = slots_of(geometry);
+	tools.slots = slots_of(job->geometry);
 	if (*job->iteration == 0)
 		warning_tell(job->warnings, "rays_left_out",
 			     "%zu voxels have at least %g HU or belong to such: iterations leave out the %.3g %% of "
 			     "the rays that pass them",
-			     dense->found, 1000 * (DENSE - 1), 100 * (double)dense->replaced / rays);
+			     dense->found, 1000 * (DENSE - 1), 100 * share_of(job, dense));
 	return metal_leave_out(dense, &tools, err);
 }
 
@@ -153,16 +171,21 @@ static int leave_out(const struct correction_job *job, struct metal *dense, stru
 static int apply(const struct correction_job *job, void *state, enum correction_time time, bool *ret_changed,
 		 struct error *err)
 {
+	const bool first = *job->iteration == 0;
+	double mean = 0;
 	int code = 0;
 
 	(void)time;
 	(void)ret_changed;
 	if (!job->subsets)
 		return 0;
-	if (*job->iteration == 0)
-		code = find(job, state, err);
+	if (first)
+		code = find(job, state, &mean, err);
 	if (code == 0)
 		code = find_traces(job, state, err);
+	/* A run that goes on has the list of what was left out, or none. */
+	if (code == 0 && first && share_of(job, state) > RAYS_MOST && mean < SURELY * job->recipe->mu_water)
+		metal_clear(state);
 	return code == 0 ? leave_out(job, state, err) : code;
 }
 

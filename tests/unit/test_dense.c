@@ -31,12 +31,22 @@ static const struct {
     {"at the side of the grid", 1, 5, 95, 17, true},
     {"screws", 2, 3, 50, 17, true},
     {"vessels with contrast", 2, 4, 40, 1.6, false},
+    {"a skull that is denser than any", 0, 0, 0, 0, false},
+};
+/* Half of all rays pass it. Of its voxels a twentieth have 3.1 times water's attenuation in the FDK volume. */
+static const struct ellipsoid skull[] = {
+    {SHAPE_CYLINDER, {85, 72, 250}, {2, 3, 0}, 0, 3.7 * .0192},
+    {SHAPE_CYLINDER, {77, 64, 250}, {2, 3, 0}, 0, -2.7 * .0192},
 };
 
 static struct phantom phantom_of(int i, struct ellipsoid ret_parts[PARTS_MOST])
 {
 	int count = BODY_PARTS;
 
+	if (tries[i].rods == 0) {
+		memcpy(ret_parts, skull, sizeof(skull));
+		return (struct phantom){COUNT(skull), ret_parts};
+	}
 	memcpy(ret_parts, body_parts, sizeof(body_parts));
 	for (int k = 0; k < tries[i].rods; k++) {
 		const double angle = 2 * M_PI * k / tries[i].rods - 1.41, from_axis = tries[i].from_axis;

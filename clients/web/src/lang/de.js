@@ -582,7 +582,7 @@ export const strings = {
 	'The patient is wider than the detector, and the reconstruction began with an empty image: it is too faint, most of all towards its rim.': 'Der Patient ist breiter als der Detektor, und die Rekonstruktion begann leer: Sie ist zu schwach, vor allem zum Rand hin.',
 	'The patient goes on outside of the image, and the image allows for it.': 'Der Patient geht außerhalb des Bildes weiter, und das Bild berücksichtigt es.',
 	'The image\'s voxels are coarser than what the projections show, which was smoothed to fit them; smaller voxels would show more.': 'Die Voxel sind gröber als das, was die Projektionen zeigen; es wurde dafür geglättet. Kleinere Voxel würden mehr zeigen.',
-	'There is something very dense in the image, such as metal: expect streaks around it.': 'Im Bild liegt etwas sehr Dichtes, etwa Metall: Um dieses herum ist mit Streifen zu rechnen.',
+	'There is something very dense in the image, metal or as dense as that: expect streaks around it.': 'Im Bild liegt etwas sehr Dichtes, Metall oder so dicht wie Metall: Um dieses herum ist mit Streifen zu rechnen.',
 	'The projections show more than the image can hold, finer detail or a part of the patient beyond the detector, so that later iterations change it less.': 'Die Projektionen zeigen mehr, als das Bild fassen kann, Feineres oder einen Teil des Patienten jenseits des Detektors; spätere Iterationen ändern es deshalb weniger.',
 	'The image lies where no projection sees it: it shows nothing.': 'Das Bild liegt, wo keine Projektion es sieht: Es zeigt nichts.',
 	'The image was asked for as a single voxel or a line of voxels.': 'Das Bild wurde als einzelnes Voxel oder als Linie verlangt.',
