@@ -1134,6 +1134,27 @@ test('a grid that is asked for again with other voxels stays about its middle', 
 	await page.context().close()
 })
 
+test('a refinement is asked for by its boxes, and with a reference', async () => {
+	const page = await openFinished()
+	await page.click('button:has-text("Reconstruct again")')
+	await page.click('dialog .expert summary')
+	await page.locator('dialog fieldset:has(> legend:has-text("Geometry")) legend input').check()
+	expect(!await page.isChecked('dialog [name="/refine/geometry"]') && !await page.isChecked('dialog [name="/refine/motion"]'), 'boxes that say what is asked for')
+	await page.check('dialog [name="/refine/geometry"]')
+	await page.fill('dialog [name="/refine/reference"]', '1m7yam2f9rgevqe7')
+	let refine = null
+	await page.route('**/v1/jobs', route => {
+		if (route.request().method() !== 'POST')
+			return route.continue()
+		refine = route.request().postDataJSON().refine
+		return route.fulfill({ json: { id: finished } })
+	})
+	await page.click('dialog button[type=submit]')
+	await page.waitForSelector('dialog', { state: 'detached' })
+	expect(refine.geometry === true && refine.motion !== true && JSON.stringify(refine.reference) === '{"job":"1m7yam2f9rgevqe7"}', `what was asked for: ${JSON.stringify(refine)}`)
+	await page.context().close()
+})
+
 /* ---- looks ---- */
 
 test('a phone: one column, nothing beside the screen', async () => {

@@ -13,8 +13,8 @@ const rows = JSON.parse(readFileSync(process.argv[3], 'utf8')).job
 
 /* Lists have a field for each number. The grid's corner has none: the form keeps the grid about its middle. */
 const without = new Set(['/grid/origin_mm'])
-/* No parameter of the table: a list of volumes. */
-const others = new Set(['/emit'])
+/* No parameters of the table: a list of volumes, and a job. */
+const others = new Set(['/emit', '/refine/reference'])
 
 const fields = new Map(groups.flatMap(group => group.fields).map(field => [field.pointer, field]))
 const wanted = new Map(rows.filter(({ pointer }) => !without.has(pointer))
@@ -36,6 +36,8 @@ for (const [pointer, row] of wanted) {
 		differs(`choices ${field.values}, ${row.choices} are expected`)
 	if (row.word !== field.word)
 		differs(`the word ${field.word}, ${row.word} is expected`)
+	if (row.type === 'boolean' && (field.unset ?? true) !== row.default)
+		differs(`a box that is ${row.default ? 'ticked' : 'empty'} where nothing is asked for is expected`)
 	if (row.word && (field.read(row.word) !== row.word || field.read('7') !== 7))
 		differs('text and numbers are not read as they are')
 	if (row.type.startsWith('integer') && !row.word && field.step !== 1)
@@ -68,6 +70,12 @@ for (const group of groups) {
 			differences.push(`${field.pointer}: not shown`)
 	}
 }
+
+/* A reference is asked for by its job's id, shown with it, and left out where there is none. */
+const reference = fields.get('/refine/reference'), id = '1m7yam2f9rgevqe7'
+if (JSON.stringify(reference.read(id)) !== `{"job":"${id}"}` || reference.write(reference.read(id)) !== id || reference.write(null) !== '' ||
+	valueText({ refine: { reference: { job: id } } }, reference, String) !== id || valueText({ refine: { reference: null } }, reference, String) !== null)
+	differences.push('/refine/reference: not read or written as a job')
 
 for (const line of differences)
 	console.log(line)

@@ -50,12 +50,13 @@ export const groups = [
 		number('/tv/iterations', 'Iterations', { step: 1 }), choice('/tv/after', 'After', ['fdk+sart', 'sart']), number('/tv/unit', 'Gray level, 1/mm'),
 	] },
 	{ title: 'Metal', pointer: '/metal', optional: true, rare: true, off: 'not corrected', fields: [number('/metal/threshold_hu', 'From, HU')] },
-	{ title: 'Geometry', pointer: '/refine', optional: true, rare: true, off: 'as the scan says', fields: [flag('/refine/geometry', 'Refine from the projections'), flag('/refine/motion', 'Follow the patient’s motion')] },
+	{ title: 'Geometry', pointer: '/refine', optional: true, rare: true, off: 'as the scan says', fields: [flag('/refine/geometry', 'Refine from the projections', { unset: false }), flag('/refine/motion', 'Follow the patient’s motion', { unset: false }),
+		text('/refine/reference', 'Reference', { hint: 'id of a job of the same object', empty: 'its own projections', wide: true, read: job => ({ job }), write: reference => reference?.job ?? '' })] },
 	{ title: 'Job', pointer: '', fields: [
 		text('/emit', 'Keep volumes', { hint: 'fdk, fdk-tv, iterations', empty: 'the last one only', wide: true, read: value => value.split(/[\s,]+/).filter(Boolean).map(name => /^\d+$/.test(name) ? Number(name) : name),
 			write: list => (list ?? []).join(', ') }),
 		choice('/priority', 'Priority', ['routine', 'urgent', 'stat']), text('/devices', 'Devices', { hint: 'or all', word: 'all', read: numberOrText }), choice('/precision', 'Precision', ['standard', 'reference']),
-		choice('/projector', 'Projector', ['interpolating', 'matched']), text('/binning', 'Binning, pixels', { one: 'none', hint: 'or auto', word: 'auto', read: numberOrText }), flag('/rings', 'Mend pixels that make rings'), flag('/hold_out', 'Hold one projection of twenty out'), number('/mu_water', 'Water, 1/mm'),
+		choice('/projector', 'Projector', ['interpolating', 'matched']), text('/binning', 'Binning, pixels', { one: 'none', hint: 'or auto', word: 'auto', read: numberOrText }), flag('/rings', 'Mend pixels that make rings', { unset: false }), flag('/hold_out', 'Hold one projection of twenty out', { unset: false }), number('/mu_water', 'Water, 1/mm'),
 	] },
 ]
 /* Stages for a purpose, and what each is for. */
