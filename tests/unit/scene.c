@@ -292,6 +292,29 @@ void outcome_resume(struct outcome *outcome, const struct outcome *yielded)
 	outcome->resume_noise = yielded->noise.sigma >= 0 ? &yielded->noise : NULL;
 }
 
+void expect_same_after_a_yield(const struct scene *scene, const struct recipe *recipe, int yield_at,
+			       const struct outcome *whole)
+{
+	const size_t bytes = sizeof(float) * grid_voxels(&recipe->grid);
+	struct outcome first = {.threads = 2, .yield_at = yield_at}, second = {.threads = 2};
+	struct recon_memory memory;
+	struct device *device;
+	struct error err;
+
+	scene_run(scene, recipe, &first);
+	outcome_resume(&second, &first);
+	ck_assert_int_eq(backend_cpu.open(0, &(struct device_options){.threads = 2}, &device, &err), 0);
+	ck_assert_int_eq(recon_memory(&backend_cpu, device, &scene->geometry, &whole->linearise, recipe, &memory, &err),
+			 0);
+	backend_cpu.close(device);
+	second.memory_limit = memory.total;
+	run(scene, recipe, &second);
+	ck_assert_mem_eq(second.last, whole->last, bytes);
+	ck_assert_mem_eq(outcome_volume(&second, "final"), outcome_volume(whole, "final"), bytes);
+	outcome_clear(&first);
+	outcome_clear(&second);
+}
+
 const float *outcome_volume(const struct outcome *outcome, const char *name)
 {
 	if (outcome->code < 0)

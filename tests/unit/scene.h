@@ -88,6 +88,12 @@ void scene_run(const struct scene *scene, const struct recipe *recipe, struct ou
 void run(const struct scene *scene, const struct recipe *recipe, struct outcome *outcome);
 /* What a run that goes on is given of one that has yielded, which must outlive it. */
 void outcome_resume(struct outcome *outcome, const struct outcome *yielded);
+/*
+ * Ends the test unless a run on two threads that yields after this iteration and goes on, within the memory that was
+ * forecast, has the bits of `whole`, a run on one.
+ */
+void expect_same_after_a_yield(const struct scene *scene, const struct recipe *recipe, int yield_at,
+			       const struct outcome *whole);
 const float *outcome_volume(const struct outcome *outcome, const char *name); /* ends the test where it is not there */
 void outcome_clear(struct outcome *outcome);
 

@@ -142,26 +142,13 @@ START_TEST(rays_are_left_out_to_the_same_bits_with_other_threads_and_after_a_yie
 	struct recipe recipe = default_on(&grid);
 	struct ellipsoid parts[PARTS_MOST];
 	const struct phantom phantom = phantom_of(0, parts);
-	struct outcome whole = {.threads = 1}, first = {.threads = 2, .yield_at = 2}, second = {.threads = 2};
-	struct recon_memory memory;
+	struct outcome whole = {.threads = 1};
 	struct scene scene;
-	struct device *device;
-	struct error err;
 
 	scan_of(&scene, &phantom);
 	run(&scene, &recipe, &whole);
-	scene_run(&scene, &recipe, &first);
-	outcome_resume(&second, &first);
-	ck_assert_int_eq(backend_cpu.open(0, &(struct device_options){.threads = 2}, &device, &err), 0);
-	ck_assert_int_eq(recon_memory(&backend_cpu, device, &scene.geometry, &whole.linearise, &recipe, &memory, &err),
-			 0);
-	backend_cpu.close(device);
-	second.memory_limit = memory.total;
-	run(&scene, &recipe, &second);
-	ck_assert_mem_eq(second.last, whole.last, sizeof(float) * grid_voxels(&grid));
+	expect_same_after_a_yield(&scene, &recipe, 2, &whole);
 	outcome_clear(&whole);
-	outcome_clear(&first);
-	outcome_clear(&second);
 	scene_clear(&scene);
 }
 END_TEST

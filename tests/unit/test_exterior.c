@@ -690,11 +690,8 @@ START_TEST(the_same_bits_with_other_threads_after_a_yield_and_in_just_the_memory
 	const int scan = _i == 2 ? 2 : 6;
 	struct grid grid = is_wide ? grid_of_wide(scan) : grid_between(75, 75, 5);
 	struct recipe recipe = sart_on(&grid);
-	struct outcome whole = {.threads = 1}, first = {.threads = 2, .yield_at = 1}, second = {.threads = 2};
-	struct recon_memory memory;
+	struct outcome whole = {.threads = 1};
 	struct scene scene = {0};
-	struct device *device;
-	struct error err;
 
 	if (is_wide)
 		scan_of_wide(&scene, scan);
@@ -703,20 +700,8 @@ START_TEST(the_same_bits_with_other_threads_after_a_yield_and_in_just_the_memory
 	recipe.iterate.iterations = 2;
 	recipe.projector = _i == 1 ? PROJECTOR_MATCHED : PROJECTOR_INTERPOLATING;
 	run(&scene, &recipe, &whole);
-	scene_run(&scene, &recipe, &first);
-	outcome_resume(&second, &first);
-	ck_assert_int_eq(backend_cpu.open(0, &(struct device_options){.threads = 2}, &device, &err), 0);
-	ck_assert_int_eq(recon_memory(&backend_cpu, device, &scene.geometry, &whole.linearise, &recipe, &memory, &err),
-			 0);
-	backend_cpu.close(device);
-	second.memory_limit = memory.total;
-	run(&scene, &recipe, &second);
-	ck_assert_mem_eq(second.last, whole.last, sizeof(float) * grid_voxels(&grid));
-	ck_assert_mem_eq(outcome_volume(&second, "final"), outcome_volume(&whole, "final"),
-			 sizeof(float) * grid_voxels(&grid));
+	expect_same_after_a_yield(&scene, &recipe, 1, &whole);
 	outcome_clear(&whole);
-	outcome_clear(&first);
-	outcome_clear(&second);
 	scene_clear(&scene);
 }
 END_TEST
