@@ -877,6 +877,17 @@ static int read_reference(struct reconstruction *reconstruction, struct refine_r
 	return code;
 }
 
+/* What a refinement goes by in this job: another one with the same views may have had another reference. */
+static uint64_t own_basis(const struct reconstruction *reconstruction, uint64_t basis)
+{
+	const char *slash = strrchr(reconstruction->run.directory, '/');
+
+	/* The directory's name is the job's. FNV-1a. */
+	for (const char *at = slash != NULL ? slash + 1 : reconstruction->run.directory; *at != '\0'; at++)
+		basis = (basis ^ (unsigned char)*at) * 1099511628211u;
+	return basis;
+}
+
 static int find_poses(struct reconstruction *reconstruction, struct refinement *ret_refinement, struct error *err)
 {
 	struct refine_reference reference = {.voxels = NULL};
@@ -885,13 +896,15 @@ static int find_poses(struct reconstruction *reconstruction, struct refinement *
 	if (code == 0)
 		code = recon_refine(reconstruction->recon, reference.voxels != NULL ? &reference : NULL, ret_refinement,
 				    &reconstruction->poses, err);
+	if (code == 0)
+		ret_refinement->basis = own_basis(reconstruction, ret_refinement->basis);
 	free((void *)(uintptr_t)reference.voxels);
 	return code;
 }
 
 /*
- * What the run has found whose checkpoint is gone on from, or one that ended before it had any and went by the same.
- * False where it is not there whole: it is found again then.
+ * What the run has found whose checkpoint is gone on from, or one that ended before it had any. False where it is not
+ * there whole, or is another's: it is found again then.
  */
 static bool read_refined(const struct reconstruction *reconstruction, struct refinement *ret_refinement)
 {
@@ -902,7 +915,7 @@ static bool read_refined(const struct reconstruction *reconstruction, struct ref
 		    path_join(path, sizeof(path), reconstruction->run.directory, REFINEMENT_FILE, "", &ignored) == 0 &&
 		    sealed_read(path, &document, &ignored) == 0 &&
 		    refinement_parse(document, ret_refinement, &ignored) == 0 &&
-		    (reconstruction->resumed || ret_refinement->basis == recon_refine_basis(reconstruction->recon));
+		    ret_refinement->basis == own_basis(reconstruction, recon_refine_basis(reconstruction->recon));
 
 	cJSON_Delete(document);
 	return read;

@@ -190,6 +190,21 @@ test_few_noisy_views_are_refined_with_the_volume_of_another_job() {
 	req GET "/v1/jobs/$waiting/refinement"
 	[ "$(jq -cS . "$body")" = "$found" ] || fail "what was found before"
 	mv "$work/final.nii" "$reference"
+
+	# That of another job, of the same scan, is no job's own: it looks again, for which it wants the reference.
+	local other
+	req POST /v1/jobs -H 'Content-Type: application/json' -d "{\"scan\": \"$scan\", $grid, \"fdk\": {}, \"sart\": {\"iterations\": 300},
+		\"refine\": {\"geometry\": true, \"reference\": {\"job\": \"$good\"}}}"
+	expect_status 202
+	other=$(jq -r .id "$body")
+	until req GET "/v1/jobs/$other" && jq -e '.iteration >= 2' "$body" >/dev/null; do sleep 0.02; done
+	cp "$state/jobs/$waiting/refinement.json" "$state/jobs/$other/"
+	mv "$reference" "$work/"
+	kill -9 "$(worker_of)"
+	job=$other
+	wait_job failed
+	expect_json '.error.detail | test("reference")'
+	mv "$work/final.nii" "$reference"
 	req DELETE "/v1/jobs/$good"
 	expect_status 204
 }
