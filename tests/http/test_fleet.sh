@@ -110,6 +110,7 @@ test_a_zombie_is_not_heard() {
 }
 
 test_an_owner_that_is_killed_goes_on_where_the_other_host_is() {
+	local lease=60 # longer than a daemon takes to start, on however loaded a machine
 	begin
 	undisturbed "$scan_dir" "$long" long
 	taker a
