@@ -81,7 +81,8 @@ static int read_content(int file, const char *path, char **ret_text, size_t *ret
 
 int sealed_read(const char *path, cJSON **ret_document, struct error *err)
 {
-	const int file = open(path, O_RDONLY | O_CLOEXEC);
+	/* A pipe in its place is damage, and nothing to wait for. */
+	const int file = open(path, O_RDONLY | O_CLOEXEC | O_NONBLOCK);
 	char *text = NULL;
 	size_t length = 0;
 	int code;

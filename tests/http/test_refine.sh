@@ -115,6 +115,11 @@ test_a_refined_geometry_is_kept_for_the_arm_s_next_scan() {
 	expect_json '.type == "urn:cbctd:problem:damaged"'
 	keep "$job"
 	expect_problem 500
+	# Nor does anybody wait for a pipe in its place.
+	mkfifo "$state/jobs/$job/refinement.json"
+	req GET "/v1/jobs/$job/refinement" --max-time 20
+	expect_problem 500
+	expect_json '.type == "urn:cbctd:problem:damaged"'
 	mv "$work/refinement.json" "$state/jobs/$job/"
 
 	cbct simulate "${head[@]}" --wobble 3 --kind matrices --truth "$work/head-truth.nii" --grid 40 --spacing 4 -o "$work/head" >/dev/null
