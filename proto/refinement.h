@@ -38,6 +38,11 @@ cJSON *refined_json(const struct refined *refined);
  * What refined_json says of the refinement itself, to the bit. ERR_INVALID or ERR_IMPOSSIBLE: it is no such document.
  */
 int refinement_parse(const cJSON *json, struct refinement *ret_refinement, struct error *err);
+/*
+ * Such a document as a plot: shifts above, turns below, three lines each over the views; 8 bit gray. Allocates *ret_png
+ * (free). ERR_CONFLICT: nothing was changed.
+ */
+int refinement_picture(const cJSON *document, char **ret_png, size_t *ret_length, struct error *err);
 /* One sentence with the numbers, and the code of the warning that tells it. */
 const char *refined_tell(const struct refined *refined, char *ret_detail, size_t size);
 /* Whether a warning of this code is one of refined_tell's, which come after the document. */

@@ -1,11 +1,14 @@
 /* cbct refinement: what a job of a daemon has refined in each view, and keeping it as a calibration. */
 #include <stdio.h>
+#include <stdlib.h>
 
 #include "clients/cbct/commands.h"
 #include "clients/cbct/http.h"
+#include "clients/cbct/output.h"
+#include "proto/refinement.h"
 
 struct refinement_options {
-	const char *job, *arm;
+	const char *job, *arm, *plot;
 	bool keep, json;
 	struct http_options http;
 };
@@ -17,6 +20,7 @@ struct refinement_options {
 static const struct option rows[] = {
     ROW("keep", OPTION_FLAG, keep, NULL, "keep it as a calibration for other scans of the arm, and print its id alone"),
     ROW("arm", OPTION_TEXT, arm, "NAME", "with --keep: a name of the arm, for people"),
+    ROW("plot", OPTION_TEXT, plot, "FILE", "a plot of it as PNG in place of the table; - is standard output"),
     ROW("json", OPTION_FLAG, json, NULL, "the daemon's document as it is"),
     {0},
 };
@@ -78,6 +82,23 @@ static void print_table(const cJSON *document)
 	}
 }
 
+static int write_plot(const cJSON *document, const char *path, struct error *err)
+{
+	size_t length = 0;
+	char *png = NULL;
+	FILE *file;
+	int code = refinement_picture(document, &png, &length, err);
+
+	if (code == 0)
+		code = output_open(path, &file, err);
+	if (code == 0) {
+		fwrite(png, 1, length, file);
+		code = output_close(file, path, err);
+	}
+	free(png);
+	return code;
+}
+
 static int refinement_run(const void *values, struct error *err)
 {
 	const struct refinement_options *options = values;
@@ -91,7 +112,9 @@ static int refinement_run(const void *values, struct error *err)
 		code = keep(options, http, err);
 	} else if (code == 0) {
 		code = http_json(http, "GET", path, &document, err);
-		if (code == 0 && options->json)
+		if (code == 0 && options->plot != NULL)
+			code = write_plot(document, options->plot, err);
+		else if (code == 0 && options->json)
 			code = document_print(document, err);
 		else if (code == 0)
 			print_table(document);

@@ -730,6 +730,10 @@ class Client:
         """What a job with ``"refine"`` has changed in each view, mm and degrees, and the geometry that was found."""
         return self._json("GET", f"/v1/jobs/{job}/refinement")
 
+    def refinement_plot(self, job: str) -> bytes:
+        """The same as a plot, PNG: shifts and turns over the views."""
+        return self._bytes(f"/v1/jobs/{job}/refinement", {"format": "png"})
+
     def annotations(self, job: str) -> Tuple[Document, str]:
         """What was measured in the job's volumes, and the tag that a change of it names."""
         reply = self._request("GET", f"/v1/jobs/{job}/annotations")

@@ -68,7 +68,7 @@ const struct route api_routes[] = {
     {"GET", "/v1/jobs/{}/annotations", ROLE_VIEW, annotations_get, BODY_NONE, 0, NULL, NULL, NULL},
     {"PUT", "/v1/jobs/{}/annotations", ROLE_ACQUIRE, annotations_put, BODY_WHOLE, ANNOTATIONS_BYTES_MAX, NULL, NULL,
      NULL},
-    {"GET", "/v1/jobs/{}/refinement", ROLE_VIEW, refinement_get, BODY_NONE, 0, NULL, NULL, NULL},
+    {"GET", "/v1/jobs/{}/refinement", ROLE_VIEW, refinement_get, BODY_NONE, 0, NULL, NULL, "format"},
     {"GET", "/v1/jobs/{}/checkpoint", ROLE_VIEW, checkpoint_get, BODY_NONE, 0, NULL, NULL, NULL},
     {"PUT", "/v1/jobs/{}/checkpoint/{}", ROLE_ACQUIRE, checkpoint_put, BODY_STREAM, 0, checkpoint_begin,
      checkpoint_data, NULL},

@@ -1,23 +1,74 @@
 /* /v1/jobs/{}/refinement, and POST /v1/calibrations of what a job has refined. */
 #include <stdio.h>
+#include <stdlib.h>
 
 #include "daemon/api/internal.h"
 #include "proto/json.h"
+#include "proto/refinement.h"
 
 enum { ARM_MOST = 255 }; /* characters */
 
+/* A plot that a request waits for. */
+struct wanted {
+	cJSON *document;
+};
+
+static int draw_wanted(void *subject, struct picture *picture, char **ret_png, size_t *ret_length, struct error *err)
+{
+	const struct wanted *wanted = subject;
+
+	(void)picture;
+	return refinement_picture(wanted->document, ret_png, ret_length, err);
+}
+
+static void add_headers(void *subject, struct request *request)
+{
+	(void)subject;
+	request_reply_header(request, "Content-Type", "image/png");
+	request_reply_header(request, "Cache-Control", "private, no-cache");
+}
+
+static void free_wanted(void *subject)
+{
+	struct wanted *wanted = subject;
+
+	cJSON_Delete(wanted->document);
+}
+
+static const struct picture_kind plots = {draw_wanted, add_headers, free_wanted};
+
+/* Takes the document. */
+static int reply_plot(struct api *api, struct request *request, cJSON *document, struct error *err)
+{
+	struct wanted *wanted = malloc(sizeof(*wanted));
+
+	if (wanted != NULL)
+		wanted->document = document;
+	else
+		cJSON_Delete(document);
+	return picture_begin(api, request, &plots, wanted, err);
+}
+
 int refinement_get(void *context, struct request *request, struct error *err)
 {
+	static const char *const formats[] = {"json", "png", NULL};
 	struct api *api = context;
 	cJSON *document = NULL;
 	struct job *job;
-	int code = jobs_find(api->jobs, request_argument(request, 0), &job, err);
+	int format, code;
 
+	if (request_state(request) != NULL)
+		return picture_go_on(request, err);
+	code = query_choice(request, "format", formats, &format, err);
+	if (code == 0)
+		code = jobs_find(api->jobs, request_argument(request, 0), &job, err);
 	if (code != 0)
 		return code;
 	code = job_refinement(job, &document, err);
 	job_release(job);
-	return code != 0 ? code : request_reply_json(request, 200, document, err);
+	if (code != 0)
+		return code;
+	return format == 0 ? request_reply_json(request, 200, document, err) : reply_plot(api, request, document, err);
 }
 
 /* The refinement of a job, where it is one that can be kept. */

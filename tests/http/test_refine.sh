@@ -42,6 +42,10 @@ test_a_geometry_that_fits_stays() {
 	[ "$(digest)" = "$plain" ] || fail "nothing was changed, and the volume is another one"
 	req GET "/v1/jobs/$job/refinement"
 	expect_json '.accepted == false and .views == [] and .geometry == null and .rms_mm == 0 and .held_out.views == 8'
+	req GET "/v1/jobs/$job/refinement?format=png"
+	expect_problem 409
+	req GET "/v1/jobs/$job/refinement?format=gif"
+	expect_problem 400
 	keep "$job"
 	expect_problem 409 /job
 	req POST /v1/jobs -H 'Content-Type: application/json' \
@@ -96,6 +100,11 @@ test_a_refined_geometry_is_kept_for_the_arm_s_next_scan() {
 	expect_problem 404
 	cbct refinement "$job" >"$work/table" 2>"$work/said" || fail "$(cat "$work/said")"
 	[ "$(wc -l <"$work/table")" = 65 ] || fail "a line for each view: $(cat "$work/table")"
+	cbct refinement "$job" --plot "$work/plot.png" || fail "a plot"
+	req GET "/v1/jobs/$job/refinement?format=png"
+	expect_status 200
+	[ "$(header content-type)" = image/png ] || fail "its type: $(header content-type)"
+	cmp "$body" "$work/plot.png" || fail "the daemon's plot is that of the client"
 	cbct refinement "$job" --keep --arm right >"$work/kept" || fail "what it has kept"
 	/usr/bin/python3 - "$url" "$job" <<-'END' || fail "what Python has asked for"
 		import sys
@@ -103,7 +112,7 @@ test_a_refined_geometry_is_kept_for_the_arm_s_next_scan() {
 		import cbctd
 		url, job = sys.argv[1:]
 		with cbctd.Client(url) as client:
-		    assert client.refinement(job)["accepted"]
+		    assert client.refinement(job)["accepted"] and client.refinement_plot(job)[:4] == b"\x89PNG"
 		    kept = client.keep_refinement(job, arm="middle")
 		    assert kept["job"] == job and client.calibration(kept["id"])["geometry"] == client.refinement(job)["geometry"]
 	END

@@ -5,6 +5,7 @@
 #include <stdlib.h>
 #include <string.h>
 
+#include "proto/refinement.h"
 #include "proto/slice.h"
 
 enum { NX = 7, NY = 5, NZ = 4, COUNT = NX * NY * NZ };
@@ -144,6 +145,53 @@ START_TEST(png_reads_back_as_it_was)
 }
 END_TEST
 
+/* Views whose shift along the columns grows from 0 to 1 mm. */
+static cJSON *refinement_document(int views)
+{
+	cJSON *document = cJSON_CreateObject(), *list = cJSON_AddArrayToObject(document, "views");
+
+	cJSON_AddStringToObject(document, "kind", "geometry");
+	for (int k = 0; k < views; k++) {
+		cJSON *view = cJSON_CreateObject();
+
+		cJSON_AddNumberToObject(view, "projection", k);
+		cJSON_AddItemToObject(view, "shift_mm", cJSON_CreateDoubleArray((double[]){k / (views - 1.), 0, 0}, 3));
+		cJSON_AddItemToObject(view, "turn_deg", cJSON_CreateDoubleArray((double[3]){0}, 3));
+		cJSON_AddItemToArray(list, view);
+	}
+	return document;
+}
+
+START_TEST(a_refinement_is_plotted_over_its_views)
+{
+	enum { VIEWS = 11, WIDTH = 960, HEIGHT = 640 };
+	cJSON *document = refinement_document(VIEWS), *none = refinement_document(0);
+	unsigned char *pixels = malloc(WIDTH * HEIGHT);
+	png_image image = {.version = PNG_IMAGE_VERSION};
+	struct error err;
+	char *png;
+	size_t length;
+
+	ck_assert_int_eq(refinement_picture(none, &png, &length, &err), ERR_CONFLICT);
+	ck_assert_int_eq(refinement_picture(document, &png, &length, &err), 0);
+	ck_assert_int_ne(png_image_begin_read_from_memory(&image, png, length), 0);
+	ck_assert_int_eq((int)image.width, WIDTH);
+	ck_assert_int_eq((int)image.height, HEIGHT);
+	ck_assert_int_ne(png_image_finish_read(&image, NULL, pixels, WIDTH, NULL), 0);
+	/* The panel is 232 pixels high from 44 on, and a twentieth of the range stays free above and below. */
+	for (int k = 1; k < VIEWS - 1; k++) {
+		const int column = 96 + 84 * k, row = 44 + (int)lround(232 * (1.05 - k / 10.) / 1.1);
+
+		ck_assert_int_lt(pixels[row * WIDTH + column], 128); /* black covers at least half of it */
+		ck_assert_int_gt(pixels[(row - 9) * WIDTH + column], 200);
+	}
+	free(png);
+	free(pixels);
+	cJSON_Delete(document);
+	cJSON_Delete(none);
+}
+END_TEST
+
 Suite *slice_suite(void)
 {
 	Suite *suite = suite_create("slice");
@@ -154,6 +202,7 @@ Suite *slice_suite(void)
 	tcase_add_test(planes, a_sheet_has_every_plane_in_reading_order);
 	tcase_add_test(planes, a_sheet_of_a_large_volume_is_made_smaller_and_stays_inside);
 	tcase_add_test(planes, png_reads_back_as_it_was);
+	tcase_add_test(planes, a_refinement_is_plotted_over_its_views);
 	suite_add_tcase(suite, planes);
 	return suite;
 }
