@@ -155,6 +155,19 @@ static bool fit_map(const struct task *task, const struct pair *pairs, int count
 	return true;
 }
 
+/* Sums over two by two bins of two rows, and the largest of them. */
+static int sum_windows(const unsigned short *above, const unsigned short *below, int count, int *ret_sums)
+{
+	int most = 0;
+
+#pragma omp simd reduction(max : most)
+	for (int x = 0; x < count; x++) {
+		ret_sums[x] = above[x] + above[x + 1] + below[x] + below[x + 1];
+		most = ret_sums[x] > most ? ret_sums[x] : most;
+	}
+	return most;
+}
+
 /* Shifts a map by what most pairs vote for; returns how many do. */
 static int vote(const struct task *task, struct affine *map)
 {
@@ -164,7 +177,7 @@ static int vote(const struct task *task, struct affine *map)
 	const int bins = (int)(2 * most / bin) + 1;
 	unsigned short votes[BINS_MOST][BINS_MOST];
 	double nearest = INFINITY, by_votes[2] = {0};
-	int best = 0;
+	int best = 1; /* no shift without a vote */
 
 	for (int y = 0; y < bins; y++)
 		memset(votes[y], 0, (size_t)bins * sizeof(**votes));
@@ -181,19 +194,23 @@ static int vote(const struct task *task, struct affine *map)
 				votes[(int)y][(int)x]++;
 		}
 	}
-	for (int y = 0; y + 1 < bins; y++)
+	for (int y = 0; y + 1 < bins; y++) {
+		int sums[BINS_MOST];
+
+		if (sum_windows(votes[y], votes[y + 1], bins - 1, sums) < best)
+			continue;
 		for (int x = 0; x + 1 < bins; x++) {
-			const int sum = votes[y][x] + votes[y][x + 1] + votes[y + 1][x] + votes[y + 1][x + 1];
 			const double shift[2] = {(x + 1) * bin - most, (y + 1) * bin - most};
 			const double square = shift[0] * shift[0] + shift[1] * shift[1];
 
-			if (sum < best || (sum == best && square >= nearest))
+			if (sums[x] < best || (sums[x] == best && square >= nearest))
 				continue;
-			best = sum;
+			best = sums[x];
 			nearest = square;
 			by_votes[0] = shift[0];
 			by_votes[1] = shift[1];
 		}
+	}
 	map->by[2] += by_votes[0];
 	map->by[5] += by_votes[1];
 	return best;

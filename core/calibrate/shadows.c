@@ -18,6 +18,7 @@
 enum { BLOCK_RADIUS = 2 }; /* blocks, at least, of the smallest ball: for its maximum to stand out */
 enum { RING_MOST = 1024 }; /* pixels of a ring that are looked at */
 enum { BUMPS_MOST = 8192 };
+enum { BLOCKS_MEASURED = 5000 };        /* of the image of block means: their median is known to .02 of the noise */
 static const double NOISE_FACTOR = 6;   /* a candidate's height, of the noise */
 static const double HEIGHT_LEAST = .01; /* line integral: below it nothing is a ball */
 static const double WINDOW = 1.25;      /* radius of the window, of the ball's */
@@ -38,6 +39,7 @@ struct shadow_finder {
 	double start[4];
 	int expected, starts;
 	float *line, *means, *opened, *scratch;
+	float *padded; /* the image of block means with the opening's half width around it */
 	struct bump bumps[BUMPS_MOST];
 	float ring[RING_MOST], spread[RING_MOST];
 	float ring_x[RING_MOST], ring_y[RING_MOST];
@@ -68,7 +70,10 @@ struct shadow_finder *shadow_finder_open(int columns, int rows, const struct sha
 	finder->means = malloc((blocks + 1) * sizeof(float));
 	finder->opened = malloc((blocks + 1) * sizeof(float));
 	finder->scratch = malloc((blocks + 1) * sizeof(float));
-	if (finder->line == NULL || finder->means == NULL || finder->opened == NULL || finder->scratch == NULL)
+	finder->padded = malloc((size_t)(finder->wide + 2 * finder->opening) *
+				(size_t)(finder->high + 2 * finder->opening) * sizeof(float));
+	if (finder->line == NULL || finder->means == NULL || finder->opened == NULL || finder->scratch == NULL ||
+	    finder->padded == NULL)
 		return shadow_finder_free(finder);
 	return finder;
 }
@@ -81,6 +86,7 @@ struct shadow_finder *shadow_finder_free(struct shadow_finder *finder)
 	free(finder->means);
 	free(finder->opened);
 	free(finder->scratch);
+	free(finder->padded);
 	free(finder);
 	return NULL;
 }
@@ -124,32 +130,50 @@ static void extreme(float *target, const float *source, int count, bool least)
 	}
 }
 
-/* The least or greatest value within `reach` to either side, along rows and then along columns; over the border
- * nothing counts. */
-static void slide(const struct shadow_finder *finder, const float *from, float *to, float *between, bool least)
+/*
+ * Each of `rows` becomes the least or greatest of itself and the `reach` below it: over twice as many with each pass,
+ * where the last two spans overlap.
+ */
+static void extend_down(float *image, int columns, int rows, int reach, bool least)
 {
-	const int wide = finder->wide, high = finder->high, reach = finder->opening;
-
-	memcpy(between, from, (size_t)wide * (size_t)high * sizeof(*to));
-	for (int y = 0; y < high; y++) {
-		const float *row = from + (size_t)y * (size_t)wide;
-		float *target = between + (size_t)y * (size_t)wide;
-
-		for (int i = 1; i <= reach && i < wide; i++) {
-			extreme(target, row + i, wide - i, least);
-			extreme(target + i, row, wide - i, least);
-		}
+	for (int span = 1, step; span <= reach; span += step) {
+		step = span < reach + 1 - span ? span : reach + 1 - span;
+		for (int y = 0; y + step < rows; y++)
+			extreme(image + (size_t)y * (size_t)columns, image + (size_t)(y + step) * (size_t)columns,
+				columns, least);
 	}
-	memcpy(to, between, (size_t)wide * (size_t)high * sizeof(*to));
-	for (int y = 0; y < high; y++)
-		for (int i = 1; i <= reach; i++) {
-			float *target = to + (size_t)y * (size_t)wide;
+}
 
-			if (y + i < high)
-				extreme(target, between + (size_t)(y + i) * (size_t)wide, wide, least);
-			if (y - i >= 0)
-				extreme(target, between + (size_t)(y - i) * (size_t)wide, wide, least);
-		}
+/* The same of each element and those behind it in its row. */
+static void extend_right(float *row, int columns, int reach, bool least)
+{
+	for (int span = 1, step; span <= reach; span += step) {
+		step = span < reach + 1 - span ? span : reach + 1 - span;
+		extreme(row, row + step, columns - step, least);
+	}
+}
+
+/*
+ * The least or greatest value within the opening's half width to either side, along rows and then along columns; over
+ * the border nothing counts: the padding around the image is what never wins.
+ */
+static void slide(struct shadow_finder *finder, const float *from, float *to, bool least)
+{
+	const int reach = finder->opening, wide = finder->wide, high = finder->high;
+	const int across = wide + 2 * reach, down = high + 2 * reach;
+	float *padded = finder->padded;
+
+	for (size_t i = 0; i < (size_t)across * (size_t)down; i++)
+		padded[i] = least ? INFINITY : -INFINITY;
+	for (int y = 0; y < high; y++) {
+		float *row = padded + (size_t)(y + reach) * (size_t)across;
+
+		memcpy(row + reach, from + (size_t)y * (size_t)wide, (size_t)wide * sizeof(*row));
+		extend_right(row, across, 2 * reach, least);
+	}
+	extend_down(padded, across, down, 2 * reach, least);
+	for (int y = 0; y < high; y++)
+		memcpy(to + (size_t)y * (size_t)wide, padded + (size_t)y * (size_t)across, (size_t)wide * sizeof(*to));
 }
 
 static int bump_order(const void *a, const void *b)
@@ -164,7 +188,7 @@ static int bump_order(const void *a, const void *b)
 /* The median and the noise, by the median of distances from it, of every n-th block. */
 static void measure(struct shadow_finder *finder, const float *blocks, double *ret_median, double *ret_noise)
 {
-	const int count = finder->wide * finder->high, step = 1 + count / 20000;
+	const int count = finder->wide * finder->high, step = 1 + count / BLOCKS_MEASURED;
 	int taken = 0;
 
 	for (int i = 0; i < count; i += step)
@@ -195,6 +219,7 @@ static bool is_highest(const struct shadow_finder *finder, const float *above, i
 /* Local maxima above the noise, highest first; `above` is the image of block means less its opening. */
 static int find_bumps(struct shadow_finder *finder, const float *above, struct shadow_facts *facts)
 {
+	float highest = 0;
 	double median, least;
 	int count = 0;
 
@@ -204,10 +229,11 @@ static int find_bumps(struct shadow_finder *finder, const float *above, struct s
 		for (int x = 0; x < finder->wide; x++) {
 			const float height = above[(size_t)y * (size_t)finder->wide + (size_t)x] - (float)median;
 
-			facts->highest = fmax(facts->highest, height);
+			highest = height > highest ? height : highest;
 			if (height > least && count < BUMPS_MOST && is_highest(finder, above, x, y))
 				finder->bumps[count++] = (struct bump){.height = height, .place = y * finder->wide + x};
 		}
+	facts->highest = highest;
 	qsort(finder->bumps, (size_t)count, sizeof(*finder->bumps), bump_order);
 	return count < SHADOWS_MOST ? count : SHADOWS_MOST;
 }
@@ -251,9 +277,12 @@ static bool fit_plane(struct shadow_finder *finder, int count, struct plane *pla
 	return true;
 }
 
-/* The background of a shadow from a ring around it; false where too little of the ring is on the picture. */
+/*
+ * The background of a shadow from a ring around it; false where too little of the ring is on the picture. `known`: the
+ * plane is there already, of a ring some pixels aside, and tells what in this one is none of it.
+ */
 static bool find_background(struct shadow_finder *finder, const float *image, double column, double row, double radius,
-			    struct plane *ret_plane)
+			    bool known, struct plane *plane)
 {
 	const double inner = WINDOW * radius + 1.5, outer = inner + fmax(3, .6 * radius);
 	const double area = M_PI * (outer * outer - inner * inner);
@@ -274,8 +303,10 @@ static bool find_background(struct shadow_finder *finder, const float *image, do
 		}
 	if (count < 16)
 		return false;
-	*ret_plane = (struct plane){.at = select_kth(finder->spread, count, count / 2)};
-	return fit_plane(finder, count, ret_plane) && fit_plane(finder, count, ret_plane);
+	if (known)
+		return fit_plane(finder, count, plane);
+	*plane = (struct plane){.at = select_kth(finder->spread, count, count / 2)};
+	return fit_plane(finder, count, plane) && fit_plane(finder, count, plane);
 }
 
 /* Sums over a window of what is above the background. */
@@ -305,12 +336,14 @@ static bool take_moments(const struct shadow_finder *finder, const float *image,
 			const double dx = x - column, dy = y - row, square = dx * dx + dy * dy;
 			double value;
 
+			double inside = 1;
+
 			/* The outermost pixels count by the part of them that is inside, or the window's edge moves
 			 * the centroid in steps. */
-			const double inside = fmin(1, window - sqrt(square) + .5);
-
-			if (inside <= 0)
+			if (square >= (window + .5) * (window + .5))
 				continue;
+			if (square > (window - .5) * (window - .5))
+				inside = window - sqrt(square) + .5;
 			value = inside * (image[(size_t)y * (size_t)finder->columns + (size_t)x] - plane->at -
 					  plane->by_x * dx - plane->by_y * dy);
 			m.mass += value;
@@ -348,7 +381,7 @@ static void take_agreement(const struct shadow_finder *finder, const float *imag
 			sums.squares += value * value;
 			sums.chords += chord * chord;
 			sums.both += chord * value;
-			sums.noise += variance * exp(fmax(0, fmin(8, value)));
+			sums.noise += variance * (value > 0 ? exp(value < 8 ? value : 8) : 1);
 		}
 	*ret = sums;
 }
@@ -380,7 +413,7 @@ static bool settle(struct shadow_finder *finder, const float *image, double star
 		struct moments m;
 		double found, shift;
 
-		if (!find_background(finder, image, shadow->column, shadow->row, radius, &plane) ||
+		if (!find_background(finder, image, shadow->column, shadow->row, radius, i > 0, &plane) ||
 		    !take_moments(finder, image, shadow->column, shadow->row, radius, &plane, &m) || m.second <= 0)
 			return false;
 		/* <rho^2> of chord lengths over their disc is 2/5 R^2. */
@@ -390,6 +423,7 @@ static bool settle(struct shadow_finder *finder, const float *image, double star
 			return false;
 		shadow->column += m.column / m.mass;
 		shadow->row += m.row / m.mass;
+		plane.at += plane.by_x * m.column / m.mass + plane.by_y * m.row / m.mass;
 		shift += fabs(found - radius);
 		radius = found;
 		if (radius < .4 * start || radius > 2.5 * start || radius < .7)
@@ -434,8 +468,8 @@ int shadows_find(struct shadow_finder *finder, const float *image, struct shadow
 
 	block_means(finder, image);
 	measure(finder, finder->means, &facts.median, &spread);
-	slide(finder, finder->means, finder->opened, finder->scratch, true);
-	slide(finder, finder->opened, finder->opened, finder->scratch, false);
+	slide(finder, finder->means, finder->opened, true);
+	slide(finder, finder->opened, finder->opened, false);
 	for (int i = 0; i < blocks; i++)
 		finder->means[i] -= finder->opened[i];
 	bumps = find_bumps(finder, finder->means, &facts);
