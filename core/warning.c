@@ -132,6 +132,9 @@ const struct warning_kind warning_kinds[] = {
      "Some projections lie aside of the others, as when the patient or the arm moves; they were left out where that "
      "was "
      "possible."},
+    {"misplaced_views", SEVERITY_SERIOUS,
+     "Some projections were not taken where the scan says, as when they are exchanged; they were put in their places "
+     "or left out, where that was possible."},
     {"spoiled_views", SEVERITY_SERIOUS,
      "Spoiled projections could neither be corrected nor left out: the image may be wrong."},
     {"no_object", SEVERITY_SERIOUS, "No projection shows anything: the image is empty."},

@@ -152,7 +152,8 @@ static void warn_of_outliers(const struct input *input, int views, const struct 
 {
 	struct outlier_report reports[OUTLIER_KINDS];
 	const struct outlier_report *dark = &reports[OUTLIER_DARK], *frozen = &reports[OUTLIER_FROZEN],
-				    *level = &reports[OUTLIER_LEVEL], *shifted = &reports[OUTLIER_SHIFTED];
+				    *level = &reports[OUTLIER_LEVEL], *shifted = &reports[OUTLIER_SHIFTED],
+				    *misplaced = &reports[OUTLIER_MISPLACED];
 	char done[96], parts[96];
 	int count = 0;
 
@@ -189,6 +190,13 @@ static void warn_of_outliers(const struct input *input, int views, const struct 
 		    "%d projections, the first of them is %d, lie aside of those beside them, by %.3g %% of "
 		    "the detector in projection %d: did the patient or the arm move? %s",
 		    shifted->views.count, shifted->first, 100 * fabs((double)shifted->amount), shifted->worst, done);
+	if (misplaced->views.count > 0)
+		warning_tell_views(sink, "misplaced_views", &misplaced->views,
+				   "%d projections, the first of them is %d, do not fit where the scan says that they "
+				   "were taken, and fit elsewhere: were projections exchanged, or numbered in another "
+				   "order? %d of them were put where they fit, %d were left out",
+				   misplaced->views.count, misplaced->first, misplaced->views.mended,
+				   misplaced->views.left_out);
 }
 
 static int compare_numbers(const void *a, const void *b)

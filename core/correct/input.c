@@ -9,7 +9,18 @@
 #include "core/correct/air.h"
 #include "core/correct/correction.h"
 #include "core/correct/counts.h"
+#include "core/correct/misplaced.h"
 #include "core/truncation.h"
+
+/* Columns and rows, exchanged where `turned`. */
+struct upright {
+	int pixels[2];
+};
+static struct upright upright(const struct input *input)
+{
+	return input->turned ? (struct upright){{input->rows, input->columns}}
+			     : (struct upright){{input->columns, input->rows}};
+}
 
 /* [row][column] to [column][row], pixels of 1, 2 or 4 bytes. */
 static void exchange(const struct input *input, const void *from, size_t bytes, void *to)
@@ -374,8 +385,7 @@ int input_take(struct input *input, const struct backend *backend, struct plan *
 {
 	/* Views are linearised one by one, so that those with defects, and each one's own air, are known. */
 	const struct defect_counts before = input->counts;
-	const int columns = input->turned ? input->rows : input->columns;
-	const int rows = input->turned ? input->columns : input->rows;
+	const int columns = upright(input).pixels[0], rows = upright(input).pixels[1];
 	struct defect_counts counts = {0};
 	int code;
 
@@ -467,6 +477,8 @@ static struct outlier outlier_of(const struct step *step)
 
 	if (step->kind == STEP_PART)
 		return (struct outlier){OUTLIER_DARK, (float)share};
+	if (step->kind == STEP_MISPLACED)
+		return (struct outlier){OUTLIER_MISPLACED, 1};
 	return (struct outlier){step->kind == STEP_ASIDE ? OUTLIER_SHIFTED : OUTLIER_LEVEL, step->level};
 }
 
@@ -475,15 +487,13 @@ static bool can_mend(const struct input *input, int view, bool keeps_all)
 {
 	if (input->steps[view].kind == STEP_LEVEL)
 		return input->linearise.hardening_count == 0 && (keeps_all || input_copy_of(input, view) != NULL);
-	return keeps_all && input->steps[view].kind == STEP_PART;
+	return keeps_all && steps_can_mend(&input->steps[view]);
 }
 
 /* The views between two steps. `skip`: views that are none of them; these are marked as well. */
 static int add_steps(struct input *input, bool *skip, const struct orbit *orbit, bool keeps_all, struct error *err)
 {
-	const int columns = input->turned ? input->rows : input->columns;
-	const int pixels[2] = {columns, input->turned ? input->columns : input->rows};
-	int code = steps_find(input->profiles, input->strips, pixels, skip, orbit, input->steps, err);
+	int code = steps_find(input->profiles, input->strips, upright(input).pixels, skip, orbit, input->steps, err);
 
 	for (int view = 0; view < orbit->count && code > 0; view++) {
 		struct step *step = &input->steps[view];
@@ -503,6 +513,20 @@ static int add_steps(struct input *input, bool *skip, const struct orbit *orbit,
 	return code < 0 ? code : 0;
 }
 
+/* The views that were taken elsewhere. `skip`: as above; outliers are marked as well. */
+static int add_misplaced(struct input *input, bool *skip, const struct orbit *orbit, bool keeps_all, struct error *err)
+{
+	int code;
+
+	for (int view = 0; view < orbit->count; view++)
+		skip[view] = skip[view] || input->outliers[view].kind != OUTLIER_NONE;
+	code = misplaced_find(input->strips, upright(input).pixels, skip, orbit, input->steps, err);
+	for (int view = 0; view < orbit->count && code > 0; view++)
+		if (input->steps[view].kind == STEP_MISPLACED && can_mend(input, view, keeps_all))
+			input->mended[input->mended_count++] = view;
+	return code;
+}
+
 /* What a view that is left out or mended had no counts in is told as a part that is dark, and as nothing else. */
 static void forget_defects(struct input *input, int view)
 {
@@ -519,12 +543,13 @@ static void forget_defects(struct input *input, int view)
  * Adds the outliers that can be left out to the blank views, but those that are mended; returns how many. `skip`: views
  * that are none, or lie between two steps.
  */
-static int add_outliers(struct input *input, const bool *skip, const struct orbit *orbit, bool keeps_all,
-			struct error *err)
+static int add_outliers(struct input *input, bool *skip, const struct orbit *orbit, bool keeps_all, struct error *err)
 {
 	const int before = input->left_out;
 	int code = outliers_find(input->profiles, skip, orbit, input->outliers, err);
 
+	if (code >= 0)
+		code = add_misplaced(input, skip, orbit, keeps_all, err);
 	for (int view = 0; view < orbit->count && code >= 0; view++) {
 		const bool mended = input_is_mended(input, view);
 
@@ -559,11 +584,10 @@ int input_settle(struct input *input, const struct orbit *orbit, bool keeps_all,
 	if (code == 0)
 		code = content_find_empty(input->content, blank, orbit, empty, err);
 	if (code >= 0) {
-		const int columns = input->turned ? input->rows : input->columns;
-		const int rows = input->turned ? input->columns : input->rows;
+		const struct upright size = upright(input);
 
 		found = code;
-		code = content_is_even(input->content, blank, orbit, columns, rows, &input->even, err);
+		code = content_is_even(input->content, blank, orbit, size.pixels[0], size.pixels[1], &input->even, err);
 	}
 	for (int view = 0; view < orbit->count && code >= 0; view++) {
 		if (empty[view])
@@ -594,7 +618,7 @@ bool input_lacks(const struct input *input, int views)
 	bool lacks = input_kept_in(input, views) > 0;
 
 	for (int view = 0; view < views; view++)
-		lacks = lacks || (input->steps[view].kind == STEP_PART && !input_is_mended(input, view));
+		lacks = lacks || (steps_can_mend(&input->steps[view]) && !input_is_mended(input, view));
 	return lacks;
 }
 
@@ -621,10 +645,14 @@ int input_mend(struct input *input, const struct backend *backend, struct stack 
 
 	if (bad == NULL || parts == NULL)
 		code = error_set(err, ERR_NO_MEMORY, "no memory for a list of %d views", orbit->count);
+	if (code == 0 && keeps_all)
+		code = mend_places(&tools, input->steps, err);
 	for (int i = 0; i < input->mended_count && code == 0; i++) {
 		const int view = input->mended[i];
 		const struct step *step = &input->steps[view];
 
+		if (step->kind == STEP_MISPLACED)
+			continue;
 		if (step->kind == STEP_PART) {
 			bad[view] = true;
 			parts[count++] = view;
@@ -646,40 +674,4 @@ void input_hold_out(struct input *input, const int *views, int count)
 	for (int i = 0; i < count; i++)
 		add_blank(input, views[i]);
 	input->held_out += count;
-}
-
-void input_goes_on(const struct input *input, bool ret_ends[2])
-{
-	for (int end = 0; end < 2; end++)
-		ret_ends[end] = 4 * input->ends[end] > input->views_looked_at;
-}
-
-double input_shown(const struct input *input)
-{
-	double sum = 0;
-
-	for (int i = 0; i < input->views; i++)
-		sum += pow((double)input->content[i].mean, 2) + pow((double)input->content[i].structure, 2);
-	for (int i = 0; i < input->counts.blank; i++)
-		sum -= pow((double)input->content[input->blank[i]].mean, 2) +
-		       pow((double)input->content[input->blank[i]].structure, 2);
-	return input->views > 0 ? fmax(0, sum) / input->views : 0;
-}
-
-double input_air_off_share(const struct input *input)
-{
-	/* Between two views that are looked at, one such and the other not, all may be such. */
-	return input->far_off > 0 ? fmin(1, (input->far_off + 1.) / input->views_looked_at) : 0;
-}
-
-double input_blank_share(const struct input *input, const struct orbit *orbit)
-{
-	double blank = 0, all = 0;
-
-	for (int i = 0; i < input->counts.blank; i++)
-		blank += orbit_axis_weight(orbit, input->blank[i]);
-	for (int k = 0; k < orbit->count; k++)
-		all += orbit_axis_weight(orbit, k);
-	/* Views that weigh next to nothing on the axis, as an arc's two ends, cannot stand in for the blank ones. */
-	return blank < (1 - 1e-6) * all ? blank / all : 0;
 }

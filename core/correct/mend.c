@@ -340,6 +340,56 @@ int mend_parts(const struct mend_tools *tools, const struct step *steps, const i
 	return code;
 }
 
+static bool has_from(const struct step *step)
+{
+	return step->kind == STEP_MISPLACED && step->from >= 0;
+}
+
+/* Moves projections along a chain that ends at a view, or around a cycle; marks those that are in place. */
+static int move_chain(const struct mend_tools *tools, const struct step *steps, int view, float *values, float *held,
+		      bool *done, struct error *err)
+{
+	const struct backend *backend = tools->backend;
+	int code = backend->stack_download(tools->projections, view, 1, held, err), to = view;
+
+	while (code == 0 && has_from(&steps[to]) && steps[to].from != view) {
+		code = backend->stack_download(tools->projections, steps[to].from, 1, values, err);
+		if (code == 0)
+			code = backend->stack_upload(tools->projections, to, 1, values, err);
+		done[to] = true;
+		to = steps[to].from;
+	}
+	if (code == 0 && has_from(&steps[to])) {
+		code = backend->stack_upload(tools->projections, to, 1, held, err);
+		done[to] = true;
+	}
+	return code;
+}
+
+int mend_places(const struct mend_tools *tools, const struct step *steps, struct error *err)
+{
+	const size_t pixels = (size_t)tools->geometry->columns * (size_t)tools->geometry->rows;
+	const size_t views = (size_t)tools->orbit->count;
+	float *values = malloc(2 * pixels * sizeof(*values));
+	bool *done = calloc(views, sizeof(*done)), *taken = calloc(views, sizeof(*taken));
+	int code = 0;
+
+	if (values == NULL || done == NULL || taken == NULL)
+		code = error_set(err, ERR_NO_MEMORY, "no memory for the order of %zu views", views);
+	for (size_t i = 0; i < views && code == 0; i++)
+		if (has_from(&steps[i]))
+			taken[steps[i].from] = true;
+	/* Chains begin where nobody takes the projection from; what is left then are cycles. */
+	for (int cycles = 0; cycles < 2; cycles++)
+		for (size_t i = 0; i < views && code == 0; i++)
+			if (has_from(&steps[i]) && !done[i] && (cycles > 0 || !taken[i]))
+				code = move_chain(tools, steps, (int)i, values, values + pixels, done, err);
+	free(values);
+	free(done);
+	free(taken);
+	return code;
+}
+
 int mend_level(const struct mend_tools *tools, int view, float level, struct error *err)
 {
 	const size_t pixels = (size_t)tools->geometry->columns * (size_t)tools->geometry->rows;

@@ -35,7 +35,10 @@ struct mend_area mend_area_of(const struct step *step, int columns, int rows);
 int mend_parts(const struct mend_tools *tools, const struct step *steps, const int *views, int count,
 	       double *ret_opposite, struct error *err);
 
-/* Bytes of the host that mend_parts works in. */
+/* Puts the projections of STEP_MISPLACED [views] where they belong; what `from` says of a place without one stays. */
+int mend_places(const struct mend_tools *tools, const struct step *steps, struct error *err);
+
+/* Bytes of the host that mend_parts works in, more than the others do. */
 size_t mend_bytes(int columns, int rows);
 
 /* Takes a level off a view. */

@@ -46,10 +46,19 @@ void profile_add(struct profile_sums *sums, int column, int row, int block, floa
 struct view_profile profile_of(const struct profile_sums *sums, const struct content_sums *blocks, float noise,
 			       double unusable);
 
-enum outlier_kind { OUTLIER_NONE, OUTLIER_DARK, OUTLIER_LEVEL, OUTLIER_SHIFTED, OUTLIER_FROZEN, OUTLIER_KINDS };
+enum outlier_kind {
+	OUTLIER_NONE,
+	OUTLIER_DARK,
+	OUTLIER_LEVEL,
+	OUTLIER_SHIFTED,
+	OUTLIER_FROZEN,
+	OUTLIER_MISPLACED,
+	OUTLIER_KINDS
+};
 struct outlier {
 	enum outlier_kind kind;
-	/* Share of the samples that say nothing; line integral; share of the detector's width or height, signed; 1. */
+	/* Share of the samples that say nothing; line integral; share of the detector's width or height, signed; 1; 1.
+	 */
 	float amount;
 };
 

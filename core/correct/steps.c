@@ -196,6 +196,11 @@ int steps_find(const struct view_profile *views, const struct view_strips *strip
 	return found;
 }
 
+bool steps_can_mend(const struct step *step)
+{
+	return step->kind == STEP_PART || (step->kind == STEP_MISPLACED && step->from >= 0);
+}
+
 bool steps_air(const struct view_profile *views, const struct step *step, int view, float *ret_level)
 {
 	const struct view_profile *sides[2] = {&views[step->sides[0]], &views[step->sides[1]]};

@@ -14,7 +14,7 @@
  * have. What metal hides has no such border. The run of a band turns by 120 degrees at most, or by 60 where metal may
  * hide it; views of another dose are half of all at most.
  */
-enum step_kind { STEP_NONE, STEP_LEVEL, STEP_PART, STEP_ASIDE };
+enum step_kind { STEP_NONE, STEP_LEVEL, STEP_PART, STEP_ASIDE, STEP_MISPLACED };
 
 struct step {
 	enum step_kind kind;
@@ -22,9 +22,13 @@ struct step {
 	double border;           /* as much beside it may be the part's, too */
 	int sides[2];            /* the good views before and behind the run */
 	float level;             /* line integral; INFINITY: the part has no good sample */
+	int from;                /* of STEP_MISPLACED: the view whose samples belong here; -1: none */
 };
 
 struct view_strips; /* core/correct/narrow.h */
+
+/* True if a part, or all of the view, can be had from other projections, where those are kept. */
+bool steps_can_mend(const struct step *step);
 
 /*
  * Fills ret_steps [count of the orbit]; `skip` marks views to pass over. strips: [views], of a detector of so many

@@ -386,11 +386,12 @@ static int leave_out(struct recon *recon, struct error *err)
 		code = take_back(recon, spoiled, found + mended, err);
 		free(spoiled);
 	}
-	if (code == 0)
-		code = empty_slots(recon, views, found, err);
+	/* A view that is left out may be what another place lacks. */
 	if (code == 0 && mended > 0)
 		code = input_mend(input, recon->backend, recon->projections, recon->geometry, &recon->orbit, keeps,
 				  &recon->cancel, err);
+	if (code == 0)
+		code = empty_slots(recon, views, found, err);
 	if (code == 0 && mended > 0 && recon_runs_fdk(recon))
 		code = add_mended(recon, err);
 	return code == 0 ? hold_out(recon, err) : code;

@@ -519,8 +519,8 @@ END_TEST
 /* Warnings that must not be there: of views that show nothing or do not follow, and of a scan that shows nothing. */
 static void expect_silence(const struct scene *scene, const struct linearise *linearise, const char *name)
 {
-	static const char *const codes[] = {"blank_views", "no_object",     "dark_parts",
-					    "dose_steps",  "shifted_views", "frozen_views"};
+	static const char *const codes[] = {"blank_views",   "no_object",    "dark_parts",     "dose_steps",
+					    "shifted_views", "frozen_views", "misplaced_views"};
 	const struct grid grid = grid_of(8, 8, scene->geometry.rows > 1 ? 8 : 1, 5, 5, 5);
 	struct recipe recipe = recipe_on(&grid);
 	struct outcome outcome = {.threads = 1, .linearise = *linearise};

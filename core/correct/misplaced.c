@@ -1,0 +1,455 @@
+/* Views that were taken elsewhere than the scan says: see misplaced.h. */
+#include "core/correct/misplaced.h"
+
+#include <math.h>
+#include <stdlib.h>
+
+#include "core/error.h"
+#include "core/select.h"
+
+enum { BESIDE_MOST = 3 }; /* places up to the next one that is in */
+enum { AROUND = 10, USUAL_LEAST = 4, VIEWS_LEAST = 24, PIECES_MOST = 96, PIXELS_LEAST = 16, SINGLES_MOST = 4 };
+/* Squares, of what is usual about there: cuts, a join; a single view at its own place, and at another one. */
+static const double CUTS[] = {5, 3, 2}, JOINS = 3, OFF = 6, FITS = 3;
+static const double BETTER = 4; /* times a single view fits better elsewhere */
+static const double SURE = 2;   /* times as much where no other one's place is free for it */
+enum { MOST = 2 };              /* one view in so many */
+
+/* The views that stand in a row along the ring. */
+struct search {
+	const struct ring *ring;
+	const struct view_strips *strips; /* [views] */
+	int samples[2];
+	double gap;    /* radians from a view to the next, in the mean */
+	int *views;    /* [count], of the places in the order that was found so far */
+	double *apart; /* [count], of a place from the next, mean squares */
+	double *usual; /* [count] */
+	int *work;     /* [count] */
+	double *costs; /* [PIECES_MOST][PIECES_MOST] */
+	bool *out;     /* [count], places whose view does not belong there */
+	bool *known;   /* [count], places that were looked at */
+	bool *sure;    /* [count], of those that are out */
+};
+
+/* How far a view's strips are off what lies between those of two others: the squared mean, so that little of a view,
+ * as a plate seen from its edge, counts for little. */
+static double between(const struct search *search, int view, int before, int behind, double share)
+{
+	const struct view_strips *v = &search->strips[view], *a = &search->strips[before], *b = &search->strips[behind];
+	const float part = (float)share;
+	double sum = 0;
+	int count = 0;
+
+	for (int axis = 0; axis < 2; axis++)
+		for (int s = 0; s < NARROW_STRIPS; s++)
+			for (int i = 0; i < search->samples[axis]; i++) {
+				const float p = a->p[axis][s][i], q = b->p[axis][s][i];
+				const float off = v->p[axis][s][i] - p - part * (q - p);
+
+				if (isnan(off))
+					continue;
+				sum += (double)fabsf(off);
+				count++;
+			}
+	return count > 0 ? pow(sum / count, 2) : INFINITY;
+}
+
+static double apart_of(const struct search *search, int a, int b)
+{
+	return between(search, a, b, b, 0);
+}
+
+/* The share of the second of two views at which a view lies best between them, 0 to 1. */
+static double share_between(const struct search *search, int view, int before, int behind)
+{
+	const struct view_strips *v = &search->strips[view], *a = &search->strips[before], *b = &search->strips[behind];
+	double product = 0, square = 0;
+
+	for (int axis = 0; axis < 2; axis++)
+		for (int s = 0; s < NARROW_STRIPS; s++)
+			for (int i = 0; i < search->samples[axis]; i++) {
+				const float p = a->p[axis][s][i], way = b->p[axis][s][i] - p;
+				const float off = v->p[axis][s][i] - p;
+
+				if (isnan(off * way))
+					continue;
+				product += (double)(off * way);
+				square += (double)(way * way);
+			}
+	return square > 0 ? fmin(1, fmax(0, product / square)) : 0.5;
+}
+
+/* What a third of the values about each place do not exceed, itself excepted. */
+static void make_usual(const struct search *search, const double *values, double *ret)
+{
+	const int count = search->ring->count;
+
+	for (int i = 0; i < count; i++) {
+		float around[2 * AROUND];
+		int known = 0;
+
+		for (int k = -AROUND; k <= AROUND; k++) {
+			const int at = (i + k + count) % count;
+
+			if (k != 0 && ring_place(search->ring, i + k) != NULL && isfinite(values[at]))
+				around[known++] = (float)values[at];
+		}
+		ret[i] = known >= USUAL_LEAST ? (double)select_kth(around, known, known / 3) : INFINITY;
+	}
+}
+
+/* ---- the order ---- */
+
+/* The views between two cuts: places from first to before end, which may lie beyond the ring's count. */
+struct piece {
+	int first, end;
+	bool fixed; /* stays behind the piece before it */
+};
+
+static bool is_fixed(const struct ring *ring, int place)
+{
+	return !ring_is_near(ring, place);
+}
+
+static bool is_cut(const struct search *search, int place, double cut)
+{
+	return is_fixed(search->ring, place) || search->apart[place] > cut * search->usual[place];
+}
+
+static int make_pieces(const struct search *search, double cut, struct piece pieces[PIECES_MOST])
+{
+	const int count = search->ring->count;
+	int first = -1, pieces_count = 0;
+
+	for (int i = 0; i < count && first < 0; i++)
+		if (is_cut(search, i, cut))
+			first = i + 1;
+	for (int k = 0, from = first; first >= 0 && k < count; k++) {
+		const int place = (first + k) % count;
+
+		if (!is_cut(search, place, cut))
+			continue;
+		if (pieces_count == PIECES_MOST)
+			return 0;
+		pieces[pieces_count++] =
+		    (struct piece){from, first + k + 1, is_fixed(search->ring, (from - 1 + count) % count)};
+		from = first + k + 1;
+	}
+	return pieces_count;
+}
+
+/* What it costs that a piece stands behind another one: squares, of what is usual there; INFINITY: it cannot. */
+static double cost_of(const struct search *search, const struct piece *pieces, int count, int before, int piece)
+{
+	const int all = search->ring->count;
+	const int end = (pieces[before].end - 1) % all, start = pieces[piece].first % all;
+
+	/* What a gap in the scan follows stays before it. */
+	if (before == piece || pieces[piece].fixed || pieces[(before + 1) % count].fixed)
+		return INFINITY;
+	return apart_of(search, search->views[end], search->views[start]) /
+	       fmax(search->usual[end], search->usual[(start - 1 + all) % all]);
+}
+
+/*
+ * For each piece the one that it joins, the closest ones first; all that join none stay where they are. False where
+ * they cannot. costs: [count][count], work.
+ */
+static bool join(const struct search *search, const struct piece *pieces, int count, double *costs, int *ret_before)
+{
+	bool taken[PIECES_MOST] = {false};
+
+	for (int i = 0; i < count * count; i++)
+		costs[i] = cost_of(search, pieces, count, i % count, i / count);
+	for (int p = 0; p < count; p++)
+		ret_before[p] = -1;
+	for (int k = 0; k < count; k++) {
+		int best = 0;
+
+		for (int i = 1; i < count * count; i++)
+			best = costs[i] < costs[best] ? i : best;
+		if (!(costs[best] <= JOINS))
+			break;
+		ret_before[best / count] = best % count;
+		taken[best % count] = true;
+		for (int i = 0; i < count; i++)
+			costs[best / count * count + i] = costs[i * count + best % count] = INFINITY;
+	}
+	for (int p = 0; p < count; p++) {
+		const int own = (p + count - 1) % count;
+
+		if (ret_before[p] >= 0)
+			continue;
+		if (taken[own])
+			return false;
+		taken[own] = true;
+		ret_before[p] = own;
+	}
+	return true;
+}
+
+/* Puts the pieces one behind the other, from the longest on; returns how many views are elsewhere then. */
+static int put_in_order(const struct search *search, const struct piece *pieces, int count, const int *before,
+			int *ret_views)
+{
+	const int all = search->ring->count;
+	int behind[PIECES_MOST], longest = 0, place, moved = 0, piece;
+
+	for (int p = 0; p < count; p++) {
+		behind[before[p]] = p;
+		if (pieces[p].end - pieces[p].first > pieces[longest].end - pieces[longest].first)
+			longest = p;
+	}
+	piece = longest;
+	place = pieces[longest].first;
+	for (int k = 0; k < count; k++) {
+		for (int i = pieces[piece].first; i < pieces[piece].end; i++, place++) {
+			ret_views[place % all] = search->views[i % all];
+			moved += place % all != i % all;
+		}
+		piece = behind[piece];
+		if (piece == longest && k + 1 < count)
+			return 0;
+	}
+	return moved;
+}
+
+/* Finds the order of the views with cuts of this size; returns how many are not where they were. */
+static int find_order_of(const struct search *search, double cut)
+{
+	const int count = search->ring->count;
+	struct piece pieces[PIECES_MOST];
+	const int pieces_count = make_pieces(search, cut, pieces);
+	int before[PIECES_MOST], moved;
+
+	if (pieces_count < 3 || !join(search, pieces, pieces_count, search->costs, before))
+		return 0;
+	moved = put_in_order(search, pieces, pieces_count, before, search->work);
+	if (MOST * moved > count)
+		return 0;
+	for (int i = 0; i < count && moved > 0; i++)
+		search->views[i] = search->work[i];
+	return moved;
+}
+
+/* Where views far from each other look alike, a cut between them is small. */
+static void find_order(const struct search *search)
+{
+	const int count = search->ring->count;
+	bool cut = false;
+
+	for (int i = 0; i < count; i++)
+		search->apart[i] = is_fixed(search->ring, i)
+				       ? INFINITY
+				       : apart_of(search, search->views[i], search->views[(i + 1) % count]) /
+					     fmax(1, pow(ring_turn(search->ring, i, (i + 1) % count) / search->gap, 2));
+	make_usual(search, search->apart, search->usual);
+	for (int i = 0; i < count; i++)
+		cut = cut || (!is_fixed(search->ring, i) && is_cut(search, i, CUTS[0]));
+	for (size_t i = 0; i < sizeof(CUTS) / sizeof(*CUTS) && cut; i++)
+		if (find_order_of(search, CUTS[i]) > 0)
+			return;
+}
+
+/* ---- single views ---- */
+
+/* The next place that is still in, on one side; -1 where a gap in the scan lies between or it is too far away. */
+static int beside(const struct search *search, int place, int side)
+{
+	const int count = search->ring->count;
+
+	for (int k = 1; k <= BESIDE_MOST; k++) {
+		const int at = (place + side * k + 2 * count) % count;
+
+		if (is_fixed(search->ring, side > 0 ? (at - 1 + count) % count : at))
+			return -1;
+		if (!search->out[at])
+			return at;
+	}
+	return -1;
+}
+
+/* How far a view would lie off at a place, as if the views beside it stood next to it; INFINITY: not known. */
+static double off_at(const struct search *search, int view, int place, int before, int behind)
+{
+	const struct ring *ring = search->ring;
+	double from, to;
+
+	if (before < 0 || behind < 0 || before == behind)
+		return INFINITY;
+	from = ring_turn(ring, before, place);
+	to = ring_turn(ring, place, behind);
+	return between(search, view, search->views[before], search->views[behind], from / (from + to)) /
+	       fmax(1, pow(from * to / (search->gap * search->gap), 2));
+}
+
+/* At its own place: the least of three, so that one view beside it may be wrong. */
+static double off_of(const struct search *search, int place)
+{
+	const int view = search->views[place], before = beside(search, place, -1), behind = beside(search, place, 1);
+	double off = off_at(search, view, place, before, behind);
+
+	if (!isfinite(off))
+		return off;
+	off = fmin(off, off_at(search, view, place, beside(search, before, -1), behind));
+	return fmin(off, off_at(search, view, place, before, beside(search, behind, 1)));
+}
+
+/* True if the view lies between two others as well as views usually do, whatever stands between those; better: times
+ * as well as at its own place. */
+static bool fits_elsewhere(const struct search *search, int place, double off, double better)
+{
+	const int count = search->ring->count, view = search->views[place];
+
+	for (int k = 0; k < count; k++) {
+		int next = search->out[k] || k == place ? -1 : beside(search, k, 1);
+
+		for (int skipped = 0; skipped < 2 && next >= 0; skipped++) {
+			double left;
+
+			if (next == place)
+				break;
+			left = between(search, view, search->views[k], search->views[next],
+				       share_between(search, view, search->views[k], search->views[next]));
+			if (left <= FITS * fmin(search->usual[k], search->usual[next]) && better * left <= off)
+				return true;
+			next = beside(search, next, 1);
+		}
+	}
+	return false;
+}
+
+static void look_at_singles(const struct search *search)
+{
+	for (int i = 0; i < search->ring->count; i++)
+		search->apart[i] =
+		    search->out[i] ? INFINITY
+				   : off_at(search, search->views[i], i, beside(search, i, -1), beside(search, i, 1));
+	make_usual(search, search->apart, search->usual);
+}
+
+/* Takes single views out, the worst ones first. */
+static void find_singles(const struct search *search)
+{
+	const int count = search->ring->count;
+	int found = 0, looked = 0;
+	bool *known = search->known;
+
+	look_at_singles(search);
+	while (SINGLES_MOST * found <= count && looked++ < count) {
+		int worst = -1;
+		double off;
+
+		for (int i = 0; i < count; i++)
+			if (!known[i] && isfinite(search->apart[i]) && search->apart[i] > OFF * search->usual[i] &&
+			    (worst < 0 ||
+			     search->apart[i] * search->usual[worst] > search->apart[worst] * search->usual[i]))
+				worst = i;
+		if (worst < 0)
+			return;
+		known[worst] = true;
+		off = off_of(search, worst);
+		if (!(off > OFF * search->usual[worst]) || !fits_elsewhere(search, worst, off, BETTER))
+			continue;
+		search->sure[worst] =
+		    off > SURE * OFF * search->usual[worst] && fits_elsewhere(search, worst, off, SURE * BETTER);
+		search->out[worst] = true;
+		found++;
+		look_at_singles(search);
+	}
+	for (int i = 0; i < count && SINGLES_MOST * found > count; i++)
+		search->out[i] = false;
+}
+
+/* The place whose view fits into another one's place, those of all out; -1: none, or more than one. */
+static int from_for(const struct search *search, int place)
+{
+	int from = -1;
+
+	for (int i = 0; i < search->ring->count; i++) {
+		if (!search->out[i] || i == place ||
+		    !(off_at(search, search->views[i], place, beside(search, place, -1), beside(search, place, 1)) <=
+		      FITS * search->usual[place]))
+			continue;
+		if (from >= 0)
+			return -1;
+		from = i;
+	}
+	return from;
+}
+
+static int mark(const struct search *search, struct step *ret_steps)
+{
+	const struct ring *ring = search->ring;
+	int found = 0;
+
+	for (int i = 0; i < ring->count; i++) {
+		const int view = ring->places[i].view;
+		int from = search->views[i];
+
+		if (search->out[i]) {
+			const int other = from_for(search, i);
+
+			from = other < 0 ? -1 : search->views[other];
+			/* A view that fits into two places fits into none. */
+			for (int k = 0; k < ring->count && other >= 0; k++)
+				if (k != i && search->out[k] && from_for(search, k) == other)
+					from = -1;
+		}
+		if (from == view || (from < 0 && !search->sure[i]))
+			continue;
+		ret_steps[view] = (struct step){.kind = STEP_MISPLACED, .from = from, .level = 1};
+		found++;
+	}
+	return found;
+}
+
+static int find(const struct ring *ring, const struct view_strips *strips, const int pixels[2], struct step *ret_steps,
+		struct error *err)
+{
+	const size_t count = (size_t)ring->count;
+	struct search search = {.ring = ring, .strips = strips};
+	int found = 0;
+
+	search.views = malloc(2 * count * sizeof(*search.views));
+	search.apart = malloc((2 * count + PIECES_MOST * PIECES_MOST) * sizeof(*search.apart));
+	search.out = calloc(3 * count, sizeof(*search.out));
+	if (search.views == NULL || search.apart == NULL || search.out == NULL) {
+		found = error_set(err, ERR_NO_MEMORY, "no memory for the order of %d views", ring->count);
+	} else {
+		search.work = search.views + count;
+		search.usual = search.apart + count;
+		search.costs = search.usual + count;
+		search.known = search.out + count;
+		search.sure = search.known + count;
+		search.gap = ring_turn(ring, 0, ring->count - 1) / (ring->count - 1);
+		for (int a = 0; a < 2; a++)
+			search.samples[a] = pixels[a] < NARROW_SAMPLES ? pixels[a] : NARROW_SAMPLES;
+		for (int i = 0; i < ring->count; i++)
+			search.views[i] = ring->places[i].view;
+		find_order(&search);
+		find_singles(&search);
+		found = mark(&search, ret_steps);
+	}
+	free(search.views);
+	free(search.apart);
+	free(search.out);
+	return found;
+}
+
+int misplaced_find(const struct view_strips *strips, const int pixels[2], const bool *skip, const struct orbit *orbit,
+		   struct step *ret_steps, struct error *err)
+{
+	struct ring ring;
+	int found = 0;
+
+	if (pixels[0] < PIXELS_LEAST || pixels[1] < PIXELS_LEAST)
+		return 0;
+	found = ring_open(&ring, NULL, skip, orbit, err);
+	if (found < 0)
+		return found;
+	if (ring.count >= VIEWS_LEAST)
+		found = find(&ring, strips, pixels, ret_steps, err);
+	ring_clear(&ring);
+	return found;
+}

@@ -1,0 +1,26 @@
+#ifndef CBCT_CORE_MISPLACED_H
+#define CBCT_CORE_MISPLACED_H
+
+#include "core/correct/narrow.h"
+#include "core/correct/ring.h"
+#include "core/correct/steps.h"
+
+/*
+ * Views that were taken elsewhere than the scan says: exchanged with others, one by one or in runs, or single ones that
+ * stand some degrees off. An object changes little from a view to the next. Where it changes by far more, the ring of
+ * views is cut into pieces. If the pieces in another order have no such cut, each joined to the one that goes on where
+ * it ends, that is the order in which they were taken, and the views are put there. What an object does by itself, a
+ * plate seen from its edge or a jerk of the patient, cuts the ring as well, but no other order mends that.
+ *
+ * A single view that lies far off what the views on both sides let be expected, and that lies between two other ones as
+ * well as views usually do, is left out.
+ */
+
+/*
+ * Marks these views in ret_steps [count of the orbit]; `skip` marks views to pass over, which others have found.
+ * Returns how many there are. strips: [views]; pixels: columns, rows. ERR_NO_MEMORY.
+ */
+int misplaced_find(const struct view_strips *strips, const int pixels[2], const bool *skip, const struct orbit *orbit,
+		   struct step *ret_steps, struct error *err);
+
+#endif

@@ -1,0 +1,122 @@
+/* Views that were taken elsewhere than the scan says (core/correct/misplaced.h) are put where they belong. */
+#include <check.h>
+#include <math.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+
+#include "core/correct/misplaced.h"
+#include "tests/unit/scene.h"
+
+Suite *misplaced_suite(void);
+
+enum { COLUMNS = 48, ROWS = 32, PIXELS = COLUMNS * ROWS, VIEWS = 60, EXCHANGES_MOST = 3 };
+
+static const struct {
+	int exchanged[EXCHANGES_MOST][3]; /* so many views from the first on with so many from the second on */
+	int off[2];                       /* the first view shows what the second does, half a view further on */
+	double step;                      /* degrees */
+	int mended, left_out;
+	double plate; /* 1/mm, seen from its edge in two views */
+} rows[] = {
+    {.exchanged = {{1, 7, 30}}, .step = 6, .mended = 2},
+    {.exchanged = {{1, 7, 11}, {1, 20, 52}, {1, 25, 45}}, .step = 6, .mended = 6},
+    {.exchanged = {{4, 9, 40}}, .step = 6, .mended = 8},
+    {.exchanged = {{12, 9, 30}}, .step = -6, .mended = 24},
+    {.exchanged = {{8, 12, 20}}, .step = 3.5, .mended = 16},           /* of an arc, one run behind the other */
+    {.exchanged = {{1, 0, 31}, {5, 10, 45}}, .step = 6, .mended = 12}, /* over the end of the turn */
+    {.off = {20, 22}, .step = 6, .left_out = 1},
+    {.step = 6},
+    {.step = 6, .plate = .05},
+    {.step = 3.5, .plate = .3},
+};
+enum { ROWS_OF_TEST = sizeof(rows) / sizeof(rows[0]) };
+
+static void add_body(struct scene *scene, double plate)
+{
+	struct ellipsoid parts[] = {
+	    {.shape = SHAPE_ELLIPSOID, .semi_axes = {38, 32, 28}, .centre = {2, -3, 1}, .density = 0.02},
+	    {.shape = SHAPE_ELLIPSOID, .semi_axes = {9, 8, 12}, .centre = {14, 6, 4}, .density = 0.02},
+	    {.shape = SHAPE_ELLIPSOID, .semi_axes = {4, 7, 9}, .centre = {-16, -12, -6}, .density = -0.018},
+	    {.shape = SHAPE_BOX, .semi_axes = {30, .5, 24}, .centre = {0, 12, 0}, .density = plate},
+	};
+	const struct phantom phantom = {.count = plate > 0 ? 4 : 3, .parts = parts};
+
+	scene_add(scene, &phantom);
+}
+
+static struct orbit_spec spec_of(int views, double first, double step)
+{
+	return (struct orbit_spec){COLUMNS, ROWS, views, {600, 1100, {4, 4}, {0, 0}, {0, 0}}, first, step};
+}
+
+static void exchange(float *projections, int a, int b)
+{
+	for (int i = 0; i < PIXELS; i++) {
+		const float p = projections[a * PIXELS + i];
+
+		projections[a * PIXELS + i] = projections[b * PIXELS + i];
+		projections[b * PIXELS + i] = p;
+	}
+}
+
+static void spoil(struct scene *scene, int row)
+{
+	for (int i = 0; i < EXCHANGES_MOST; i++)
+		for (int k = 0; k < rows[row].exchanged[i][0]; k++)
+			exchange(scene->projections, rows[row].exchanged[i][1] + k, rows[row].exchanged[i][2] + k);
+	if (rows[row].off[1] > 0) {
+		const struct orbit_spec spec = spec_of(1, (rows[row].off[1] + .5) * rows[row].step, rows[row].step);
+		struct scene other;
+
+		scene_orbit(&other, &spec);
+		add_body(&other, rows[row].plate);
+		memcpy(scene->projections + rows[row].off[0] * PIXELS, other.projections,
+		       PIXELS * sizeof(*other.projections));
+		scene_clear(&other);
+	}
+}
+
+/* The volume is that of the scan in its right order, but for rounding; a view that fits no other one's place is left
+ * out. */
+START_TEST(exchanged_views_are_put_in_their_places)
+{
+	const struct grid grid = grid_of(24, 24, 16, 3.6, 3.6, 3.6);
+	const struct orbit_spec spec = spec_of(VIEWS, 0, rows[_i].step);
+	struct recipe recipe = recipe_on(&grid);
+	struct outcome good = {.threads = 1}, spoiled = {.threads = 1};
+	struct scene scene;
+	char told[96];
+	double error;
+
+	recipe.fdk.on = true;
+	recipe.algorithm = &algorithm_sart;
+	recipe.iterate.iterations = 2;
+	scene_orbit(&scene, &spec);
+	add_body(&scene, rows[_i].plate);
+	run(&scene, &recipe, &good);
+	ck_assert_msg(strstr(good.warnings, "misplaced_views") == NULL, "%s", good.warnings);
+	spoil(&scene, _i);
+	run(&scene, &recipe, &spoiled);
+	error = relative_error(spoiled.last, good.last, grid_voxels(&grid));
+	snprintf(told, sizeof(told), "? %d of them were put where they fit, %d were left out", rows[_i].mended,
+		 rows[_i].left_out);
+	if (rows[_i].mended + rows[_i].left_out > 0)
+		ck_assert_msg(strstr(spoiled.warnings, told) != NULL, "row %d: %s", _i, spoiled.warnings);
+	ck_assert_msg(error < (rows[_i].left_out > 0 ? .02 : 1e-5), "row %d: %g", _i, error);
+	outcome_clear(&good);
+	outcome_clear(&spoiled);
+	scene_clear(&scene);
+}
+END_TEST
+
+Suite *misplaced_suite(void)
+{
+	Suite *suite = suite_create("misplaced");
+	TCase *tests = tcase_create("misplaced");
+
+	tcase_set_timeout(tests, 60);
+	tcase_add_loop_test(tests, exchanged_views_are_put_in_their_places, 0, ROWS_OF_TEST);
+	suite_add_tcase(suite, tests);
+	return suite;
+}
