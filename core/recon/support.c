@@ -51,43 +51,90 @@ static void ask_views(const struct geometry *geometry, const struct orbit *orbit
 	ret->gap = fmax(20 * M_PI / 180, 2.5 * orbit->arc / ret->count);
 }
 
-static int ascending(const void *a, const void *b)
+/*
+ * A ray's direction along the orbit's axis, opposite ones alike, by a number that grows with its angle of 0 to pi and
+ * costs no arctangent: 0 to 2, by half to all of what the angle grows by.
+ */
+static double turn_of(double x, double y)
 {
-	const double x = *(const double *)a, y = *(const double *)b;
-
-	return (x > y) - (x < y);
+	if (y < 0) {
+		x = -x;
+		y = -y;
+	}
+	if (y <= 0)
+		return x >= 0 ? 0 : 2;
+	return x >= 0 ? y / (x + y) : 1 - x / (y - x);
 }
 
-/* Direction of the ray from a source through a point, seen along the orbit's axis: 0 .. pi, opposite ones alike. */
-static double direction_of(const struct orbit *orbit, const double source[3], const double point[3])
+/* Radians. */
+static double angle_of(double turn)
 {
-	const double ray[3] = {point[0] - source[0], point[1] - source[1], point[2] - source[2]};
-	const double angle = atan2(vec_dot(orbit->frame[1], ray), vec_dot(orbit->frame[0], ray));
+	return turn <= 1 ? atan2(turn, 1 - turn) : M_PI / 2 + atan2(turn - 1, 2 - turn);
+}
 
-	return angle < 0 ? angle + M_PI : angle;
+/* True if from one direction to the next is more than the gap; whether it can be is seen without angles. */
+static bool is_apart(double turn, double next, double gap)
+{
+	return next - turn > 0.499 * gap && angle_of(next) - angle_of(turn) > gap;
+}
+
+/*
+ * Directions, of which only those that may border a gap are kept: the first and the last of each of TURNS parts, which
+ * are no more than 3.6 degrees wide each.
+ */
+enum { TURNS = 64 };
+struct directions {
+	double first[TURNS], last[TURNS]; /* first > last: none */
+};
+
+static void directions_add(struct directions *directions, double turn)
+{
+	const int part = least((int)(turn * (TURNS / 2)), TURNS - 1);
+
+	if (turn < directions->first[part])
+		directions->first[part] = turn;
+	if (turn > directions->last[part])
+		directions->last[part] = turn;
+}
+
+/* True if there is none, or a gap between two that are neighbours. */
+static bool directions_gap(const struct directions *directions, double gap)
+{
+	double first = -1, last = -1;
+
+	for (int i = 0; i < TURNS; i++) {
+		if (directions->first[i] > directions->last[i])
+			continue;
+		if (first < 0)
+			first = directions->first[i];
+		else if (is_apart(last, directions->first[i], gap))
+			return true;
+		last = directions->last[i];
+	}
+	return first < 0 || angle_of(first) + M_PI - angle_of(last) > gap;
 }
 
 static bool is_unseen(const struct geometry *geometry, const struct orbit *orbit, const struct asked *asked,
 		      const double point[3])
 {
-	double directions[SUPPORT_VIEWS], widest;
-	int seen = 0;
+	struct directions directions;
 
+	for (int i = 0; i < TURNS; i++) {
+		directions.first[i] = 3;
+		directions.last[i] = -1;
+	}
 	for (int i = 0; i < asked->count; i++) {
+		const double *source = asked->source[i];
+		const double ray[3] = {point[0] - source[0], point[1] - source[1], point[2] - source[2]};
 		double column, row;
 		const double depth = view_project(asked->matrix[i], point, &column, &row);
 
 		if (depth > 0 && column >= -0.5 && column <= geometry->columns - 0.5 && row >= -0.5 &&
 		    row <= geometry->rows - 0.5)
-			directions[seen++] = direction_of(orbit, asked->source[i], point);
+			directions_add(&directions,
+				       turn_of(vec_dot(orbit->frame[0], ray), vec_dot(orbit->frame[1], ray)));
 	}
-	if (seen == 0)
-		return true;
-	qsort(directions, (size_t)seen, sizeof(directions[0]), ascending);
-	widest = directions[0] + M_PI - directions[seen - 1];
-	for (int i = 1; i < seen; i++)
-		widest = fmax(widest, directions[i] - directions[i - 1]);
-	return widest > asked->gap;
+	return directions_gap(&directions, asked->gap);
 }
 
 /* The middle of one of `count` equal parts of an axis, in voxels. */

@@ -39,8 +39,8 @@ struct half {
 	struct fdk_weights weights;
 	struct plan *plan;
 	struct fdk fdk;
-	struct stack *measured, *made; /* of all views, and of half of them */
-	struct volume *volume, *whole;
+	struct stack *measured, *made;               /* of all views, and of half of them */
+	struct volume *volume, *whole, *own[HALVES]; /* of a half's views, of all, of each half's */
 	const struct reduced *reduced;
 	struct device *device;
 	const struct cancel *cancel;
@@ -94,6 +94,8 @@ static void half_clear(struct half *half)
 
 	backend->volume_free(half->volume);
 	backend->volume_free(half->whole);
+	for (int i = 0; i < HALVES; i++)
+		backend->volume_free(half->own[i]);
 	backend->stack_free(half->measured);
 	backend->stack_free(half->made);
 	fdk_clear(&half->fdk);
@@ -119,7 +121,7 @@ int agreement_bytes(const struct reduced *reduced, size_t *ret_bytes, struct err
 	if (code == 0)
 		*ret_bytes =
 		    (size_t)geometry->count * (size_t)geometry->columns * (size_t)geometry->rows * sizeof(float) +
-		    bytes.volumes + bytes.scratch + bytes.raw + 2 * backend->volume_bytes(NULL, &half.grid) +
+		    bytes.volumes + bytes.scratch + bytes.raw + (2 + HALVES) * backend->volume_bytes(NULL, &half.grid) +
 		    fdk_bytes(backend, NULL, geometry, half.weights.pad) +
 		    backend->stack_bytes(NULL, geometry->columns, geometry->rows, geometry->count) +
 		    backend->stack_bytes(NULL, geometry->columns, geometry->rows, half_of(geometry->count));
@@ -156,81 +158,85 @@ static int open_half(struct half *half, struct error *err)
 					  &half->made, err);
 	if (code == 0)
 		code = backend->volume_new(half->device, &half->grid, &half->volume, err);
+	for (int i = 0; i < HALVES && code == 0; i++)
+		code = backend->volume_new(half->device, &half->grid, &half->own[i], err);
 	return code == 0 ? backend->volume_new(half->device, &half->grid, &half->whole, err) : code;
 }
 
-/* Reprojects the views of one half, whose numbers are `views`, from a volume made of the others. */
-static int reproject(struct half *half, int which, int *views, int *ret_count, struct error *err)
+/* A volume made of all views but those of one half, from what half->measured holds. */
+static int reconstruct(struct half *half, int without, struct volume *to, struct error *err)
 {
 	const struct backend *backend = &backend_cpu;
 	const int count = half->reduced->geometry.count;
-	int others = 0, code = backend->volume_fill(half->volume, 0, err);
+	int code = backend->volume_fill(to, 0, err);
 
 	for (int k = 0; k < count && code == 0; k++) {
-		if (k % HALVES == which)
-			views[others++] = k;
-		else if (half->reduced->known[k])
-			code = fdk_add(&half->fdk, k, k, half->measured, half->volume, err);
+		if (k % HALVES != without && half->reduced->known[k])
+			code = fdk_add(&half->fdk, k, k, half->measured, to, err);
 		if (code == 0)
 			code = cancel_check(half->cancel, err);
 	}
 	if (code == 0)
-		code = fdk_flush(&half->fdk, half->measured, half->volume, err);
+		code = fdk_flush(&half->fdk, half->measured, to, err);
 	/* The weights are those of all views. */
-	if (code == 0)
-		code = backend->volume_axpby(HALVES, half->volume, 0, half->volume, err);
-	*ret_count = others;
-	return code == 0 ? backend->project(half->plan, half->volume, views, others, half->made, err) : code;
+	return code == 0 ? backend->volume_axpby(HALVES, to, 0, to, err) : code;
 }
 
 /*
- * Adds `sign` times the reprojections of each half of the views in half->measured from the other half to `made`,
- * [view][row][column]; views, picture: work. half->whole becomes the volume made of all of them.
+ * The volumes that the halves of the views make of what they measured, own[without], and half->whole of all of them,
+ * whose projections then take the place of what was measured; views: work.
  */
-static int add_reprojections(struct half *half, float sign, int *views, float *picture, float *made, struct error *err)
+static int reconstruct_measured(struct half *half, int *views, struct error *err)
 {
 	const struct geometry *geometry = &half->reduced->geometry;
 	const struct backend *backend = &backend_cpu;
-	const size_t pixels = (size_t)geometry->columns * (size_t)geometry->rows;
 	int code = backend->volume_fill(half->whole, 0, err);
+
+	for (int without = 0; without < HALVES && code == 0; without++) {
+		code = reconstruct(half, without, half->own[without], err);
+		if (code == 0)
+			code = backend->volume_axpby(1.0 / HALVES, half->own[without], 1, half->whole, err);
+	}
+	for (int k = 0; k < geometry->count; k++)
+		views[k] = k;
+	return code == 0 ? backend->project(half->plan, half->whole, views, geometry->count, half->measured, err)
+			 : code;
+}
+
+/*
+ * Reprojects the views of one half: from what the others made of the measured ones, and the whole volume less what the
+ * others make of its projections, in one go since projections add up.
+ */
+static int reproject(struct half *half, int which, int *views, int *ret_count, struct error *err)
+{
+	const struct backend *backend = &backend_cpu;
+	int code = reconstruct(half, which, half->volume, err);
+
+	*ret_count = 0;
+	for (int k = which; k < half->reduced->geometry.count; k += HALVES)
+		views[(*ret_count)++] = k;
+	if (code == 0)
+		code = backend->volume_axpby(1, half->own[which], -1, half->volume, err);
+	if (code == 0)
+		code = backend->volume_axpby(1, half->whole, 1, half->volume, err);
+	return code == 0 ? backend->project(half->plan, half->volume, views, *ret_count, half->made, err) : code;
+}
+
+/* What the others make of each view, [view][row][column]; views: work. */
+static int predict(struct half *half, int *views, float *made, struct error *err)
+{
+	const struct geometry *geometry = &half->reduced->geometry;
+	const size_t pixels = (size_t)geometry->columns * (size_t)geometry->rows;
+	int code = reconstruct_measured(half, views, err);
 
 	for (int which = 0; which < HALVES && code == 0; which++) {
 		int count;
 
 		code = reproject(half, which, views, &count, err);
-		if (code == 0)
-			code = backend->volume_axpby(1.0 / HALVES, half->volume, 1, half->whole, err);
-		for (int i = 0; i < count && code == 0; i++) {
-			float *to = made + (size_t)views[i] * pixels;
-
-			code = backend->stack_download(half->made, i, 1, picture, err);
-			for (size_t j = 0; j < pixels && code == 0; j++)
-				to[j] += sign * picture[j];
-		}
+		for (int i = 0; i < count && code == 0; i++)
+			code = backend_cpu.stack_download(half->made, i, 1, made + (size_t)views[i] * pixels, err);
 	}
 	return code;
-}
-
-/* What the others make of each view, [view][row][column]; views, picture: work. */
-static int predict(struct half *half, int *views, float *picture, float *made, struct error *err)
-{
-	const struct geometry *geometry = &half->reduced->geometry;
-	const struct backend *backend = &backend_cpu;
-	const size_t pixels = (size_t)geometry->columns * (size_t)geometry->rows;
-	int code = add_reprojections(half, 1, views, picture, made, err);
-
-	for (int k = 0; k < geometry->count; k++)
-		views[k] = k;
-	if (code == 0)
-		code = backend->project(half->plan, half->whole, views, geometry->count, half->measured, err);
-	for (int k = 0; k < geometry->count && code == 0; k++) {
-		float *to = made + (size_t)k * pixels;
-
-		code = backend->stack_download(half->measured, k, 1, picture, err);
-		for (size_t j = 0; j < pixels && code == 0; j++)
-			to[j] += picture[j];
-	}
-	return code == 0 ? add_reprojections(half, -1, views, picture, made, err) : code;
 }
 
 static int compare_views(const struct half *half, const float *made, struct view_agreement *ret_views,
@@ -368,9 +374,9 @@ static bool is_cut(const struct reduced *reduced)
 	return (double)cut > few * (double)rows;
 }
 
-/* Holds the views against what the others make of them; views, picture, made: work. */
-static int compare_with_volume(struct half *half, int *views, float *picture, float *made,
-			       struct view_agreement *ret_views, struct error *err)
+/* Holds the views against what the others make of them; views, made: work. */
+static int compare_with_volume(struct half *half, int *views, float *made, struct view_agreement *ret_views,
+			       struct error *err)
 {
 	const struct reduced *reduced = half->reduced;
 	int code = open_half(half, err);
@@ -378,7 +384,7 @@ static int compare_with_volume(struct half *half, int *views, float *picture, fl
 	if (code == 0)
 		code = backend_cpu.stack_upload(half->measured, 0, reduced->geometry.count, reduced->projections, err);
 	if (code == 0)
-		code = predict(half, views, picture, made, err);
+		code = predict(half, views, made, err);
 	return code == 0 ? compare_views(half, made, ret_views, err) : code;
 }
 
@@ -388,16 +394,16 @@ int agreement_measure(const struct reduced *reduced, const struct cancel *cancel
 	const struct geometry *geometry = &reduced->geometry;
 	const size_t count = (size_t)geometry->count, pixels = (size_t)geometry->columns * (size_t)geometry->rows;
 	struct agreement agreement = {.views = calloc(count, sizeof(*agreement.views))};
-	float *made = calloc(count * pixels, sizeof(*made)), *picture = malloc(pixels * sizeof(*picture));
+	float *made = malloc(count * pixels * sizeof(*made));
 	int *views = malloc(count * sizeof(*views));
 	struct half half;
 	int code = describe(&half, reduced, err);
 
-	if (code == 0 && (agreement.views == NULL || made == NULL || picture == NULL || views == NULL))
+	if (code == 0 && (agreement.views == NULL || made == NULL || views == NULL))
 		code = error_set(err, ERR_NO_MEMORY, "no memory for %d views in bins", geometry->count);
 	half.cancel = cancel;
 	if (code == 0 && geometry->count >= WHOLE_LEAST)
-		code = compare_with_volume(&half, views, picture, made, agreement.views, err);
+		code = compare_with_volume(&half, views, made, agreement.views, err);
 	if (code == 0)
 		code = compare_opposite(reduced, &half.orbit, &agreement, err);
 	if (code == 0) {
@@ -408,7 +414,6 @@ int agreement_measure(const struct reduced *reduced, const struct cancel *cancel
 	}
 	half_clear(&half);
 	free(made);
-	free(picture);
 	free(views);
 	if (code < 0)
 		agreement_clear(&agreement);

@@ -19,10 +19,16 @@ static const double PI = 3.14159265358979323846;
 static const double FINE = 1, COARSE = 2.5;
 static const double TUKEY = 4.685, MAD = 1.4826; /* 95 % efficiency; of a normal distribution's median deviation */
 
+/* At a pixel: derivatives of `other` by the unknowns, and the difference of both images. */
+struct slope {
+	double by[UNKNOWNS + 1];
+};
+
 /* Images [row][column] of one view. */
 struct pair {
 	int columns, rows;
 	float *image, *other, *work; /* [rows * columns] each, three of work, of one allocation */
+	struct slope *slopes;        /* of the pixels that are not at the edge, row by row */
 };
 
 /* ---- what of the detail is unexplained ---- */
@@ -83,8 +89,8 @@ static double unexplained_share(const struct pair *pair, const float *image)
 /* ---- least squares ---- */
 
 struct normal {
-	double matrix[UNKNOWNS][UNKNOWNS], right[UNKNOWNS];
-	double squares, weights; /* of what is left */
+	double rows[UNKNOWNS][UNKNOWNS + 1]; /* of the matrix, each with its right side */
+	double squares, weights;             /* of what is left */
 };
 
 /* Inverts a symmetric positive definite matrix in place; false where it is none to rounding. */
@@ -126,25 +132,65 @@ static double gradient(const struct pair *pair, size_t at, size_t step)
 	return (8 * near - far) / 24;
 }
 
-/* Derivatives of `other` by the unknowns: the shifts, a turn and a scale about the middle, and the gain. */
-static void derivatives(const struct pair *pair, int column, int row, double ret[UNKNOWNS])
+/* By the shifts, a turn and a scale about the middle, and the gain. */
+static void slope_set(const struct pair *pair, int column, int row, struct slope *ret)
 {
 	const size_t at = (size_t)row * (size_t)pair->columns + (size_t)column;
 	const double gx = gradient(pair, at, 1), gy = gradient(pair, at, (size_t)pair->columns);
 	const double x = (column - 0.5 * (pair->columns - 1)) / pair->columns;
 	const double y = (row - 0.5 * (pair->rows - 1)) / pair->columns;
 
-	ret[0] = -gx;
-	ret[1] = -gy;
-	ret[2] = y * gx - x * gy;
-	ret[3] = -x * gx - y * gy;
-	ret[4] = (double)pair->other[at];
+	ret->by[0] = -gx;
+	ret->by[1] = -gy;
+	ret->by[2] = y * gx - x * gy;
+	ret->by[3] = -x * gx - y * gy;
+	ret->by[4] = (double)pair->other[at];
+	ret->by[UNKNOWNS] = (double)pair->image[at] - (double)pair->other[at];
 }
 
-/* Which of the STRIPS strips it is in. */
-static int strip_of(int at, int pixels)
+static void slopes_set(const struct pair *pair)
 {
-	return (at - EDGE) * STRIPS / (pixels - 2 * EDGE);
+	struct slope *slope = pair->slopes;
+
+	for (int row = EDGE; row < pair->rows - EDGE; row++)
+		for (int column = EDGE; column < pair->columns - EDGE; column++)
+			slope_set(pair, column, row, slope++);
+}
+
+/* The first pixel of a strip; that of the strip behind the last one is the edge. */
+static int strip_begin(int strip, int pixels)
+{
+	return EDGE + (strip * (pixels - 2 * EDGE) + STRIPS - 1) / STRIPS;
+}
+
+/* Adds a row's pixels of one strip; what is left of each goes to ret_left. */
+static void add_up_strip(const struct slope *slopes, int count, const double unknowns[UNKNOWNS], double cut,
+			 struct normal *cell, float *ret_left)
+{
+	struct normal sums = *cell;
+
+	for (int p = 0; p < count; p++) {
+		const struct slope *slope = &slopes[p];
+		double left = slope->by[UNKNOWNS], share, weight;
+
+#pragma GCC unroll 5
+		for (int i = 0; i < UNKNOWNS; i++)
+			left -= slope->by[i] * unknowns[i];
+		share = fabs(left) / cut;
+		weight = share < 1 ? pow(1 - share * share, 2) : 0;
+#pragma GCC unroll 5
+		for (int i = 0; i < UNKNOWNS; i++) {
+			const double weighted = weight * slope->by[i];
+
+#pragma GCC unroll 6
+			for (int j = 0; j <= UNKNOWNS; j++)
+				sums.rows[i][j] += weighted * slope->by[j];
+		}
+		sums.squares += weight * left * left;
+		sums.weights += weight;
+		ret_left[p] = (float)fabs(left);
+	}
+	*cell = sums;
 }
 
 /*
@@ -154,31 +200,20 @@ static int strip_of(int at, int pixels)
 static int add_up(const struct pair *pair, const double unknowns[UNKNOWNS], double cut,
 		  struct normal cells[STRIPS][STRIPS], float *ret_left)
 {
-	int count = 0;
+	int done = 0;
 
 	memset(cells, 0, STRIPS * STRIPS * sizeof(cells[0][0]));
-	for (int row = EDGE; row < pair->rows - EDGE; row++)
-		for (int column = EDGE; column < pair->columns - EDGE; column++) {
-			const size_t at = (size_t)row * (size_t)pair->columns + (size_t)column;
-			const double difference = (double)pair->image[at] - (double)pair->other[at];
-			struct normal *sums = &cells[strip_of(row, pair->rows)][strip_of(column, pair->columns)];
-			double d[UNKNOWNS], left = difference, share, weight;
+	for (int down = 0; down < STRIPS; down++)
+		for (int row = strip_begin(down, pair->rows); row < strip_begin(down + 1, pair->rows); row++)
+			for (int across = 0; across < STRIPS; across++) {
+				const int count =
+				    strip_begin(across + 1, pair->columns) - strip_begin(across, pair->columns);
 
-			derivatives(pair, column, row, d);
-			for (int i = 0; i < UNKNOWNS; i++)
-				left -= d[i] * unknowns[i];
-			share = fabs(left) / cut;
-			weight = share < 1 ? pow(1 - share * share, 2) : 0;
-			for (int i = 0; i < UNKNOWNS; i++) {
-				for (int j = 0; j <= i; j++)
-					sums->matrix[i][j] += weight * d[i] * d[j];
-				sums->right[i] += weight * d[i] * difference;
+				add_up_strip(pair->slopes + done, count, unknowns, cut, &cells[down][across],
+					     ret_left + done);
+				done += count;
 			}
-			sums->squares += weight * left * left;
-			sums->weights += weight;
-			ret_left[count++] = (float)fabs(left);
-		}
-	return count;
+	return done;
 }
 
 /* Of all cells but those in strips from `from` to before `to`, of columns (axis 0) or of rows (1). */
@@ -192,26 +227,26 @@ static struct normal normal_without(struct normal cells[STRIPS][STRIPS], int axi
 
 		if (strip >= from && strip < to)
 			continue;
-		for (int i = 0; i < UNKNOWNS; i++) {
-			for (int j = 0; j < UNKNOWNS; j++)
-				sums.matrix[i][j] += of_cell->matrix[i > j ? i : j][i > j ? j : i];
-			sums.right[i] += of_cell->right[i];
-		}
+		for (int i = 0; i < UNKNOWNS; i++)
+			for (int j = 0; j <= UNKNOWNS; j++)
+				sums.rows[i][j] += j > i && j < UNKNOWNS ? of_cell->rows[j][i] : of_cell->rows[i][j];
 		sums.squares += of_cell->squares;
 		sums.weights += of_cell->weights;
 	}
 	return sums;
 }
 
-/* Inverts the matrix; the unknowns are 0 where there is no solution. */
-static bool solve(struct normal *normal, double ret_unknowns[UNKNOWNS])
+/* The unknowns are 0, and the inverse says nothing, where there is no solution. */
+static bool solve(const struct normal *normal, double ret_inverse[UNKNOWNS][UNKNOWNS], double ret_unknowns[UNKNOWNS])
 {
 	memset(ret_unknowns, 0, UNKNOWNS * sizeof(ret_unknowns[0]));
-	if (!(normal->weights > 0) || !invert(normal->matrix))
+	for (int i = 0; i < UNKNOWNS; i++)
+		memcpy(ret_inverse[i], normal->rows[i], UNKNOWNS * sizeof(ret_inverse[i][0]));
+	if (!(normal->weights > 0) || !invert(ret_inverse))
 		return false;
 	for (int i = 0; i < UNKNOWNS; i++)
 		for (int j = 0; j < UNKNOWNS; j++)
-			ret_unknowns[i] += normal->matrix[i][j] * normal->right[j];
+			ret_unknowns[i] += ret_inverse[i][j] * normal->rows[j][UNKNOWNS];
 	return true;
 }
 
@@ -225,10 +260,11 @@ static void doubt_by_parts(struct normal cells[STRIPS][STRIPS], const double unk
 
 			for (int part = 0; part < parts; part++) {
 				const int width = STRIPS / parts;
-				struct normal rest = normal_without(cells, axis, part * width, (part + 1) * width);
-				double without[UNKNOWNS];
+				const struct normal rest =
+				    normal_without(cells, axis, part * width, (part + 1) * width);
+				double inverse[UNKNOWNS][UNKNOWNS], without[UNKNOWNS];
 
-				solve(&rest, without);
+				solve(&rest, inverse, without);
 				for (int a = 0; a < 2; a++)
 					squares[a] += pow(without[a] - unknowns[a], 2);
 			}
@@ -241,20 +277,21 @@ static bool fit(const struct pair *pair, struct image_shift *ret_shift)
 {
 	/* A smoothed pixel shares its noise with so many others. */
 	const double alike = fmax(1, 4 * acos(-1) * FINE * FINE);
-	double unknowns[UNKNOWNS] = {0}, cut = INFINITY;
+	double inverse[UNKNOWNS][UNKNOWNS], unknowns[UNKNOWNS] = {0}, cut = INFINITY;
 	struct normal cells[STRIPS][STRIPS], normal;
 
+	slopes_set(pair);
 	for (int pass = 0; pass <= PASSES; pass++) {
 		const int count = add_up(pair, unknowns, cut, cells, pair->work);
 
 		normal = normal_without(cells, 0, 0, 0);
-		if (!solve(&normal, unknowns))
+		if (!solve(&normal, inverse, unknowns))
 			return false;
 		cut = TUKEY * MAD * (double)select_kth(pair->work, count, count / 2) + 1e-12;
 	}
 	for (int a = 0; a < 2; a++) {
 		ret_shift->bins[a] = unknowns[a];
-		ret_shift->sigma[a] = sqrt(alike * normal.squares / normal.weights * normal.matrix[a][a]);
+		ret_shift->sigma[a] = sqrt(alike * normal.squares / normal.weights * inverse[a][a]);
 		ret_shift->doubt[a] = ret_shift->sigma[a];
 	}
 	doubt_by_parts(cells, unknowns, ret_shift);
@@ -266,16 +303,24 @@ int image_shift_find(const float *image, const float *other, int columns, int ro
 {
 	const size_t pixels = (size_t)columns * (size_t)rows;
 	float *all = malloc(5 * pixels * sizeof(*all));
-	const struct pair pair = {
-	    .columns = columns, .rows = rows, .image = all, .other = all + pixels, .work = all + 2 * pixels};
+	const struct pair pair = {.columns = columns,
+				  .rows = rows,
+				  .image = all,
+				  .other = all + pixels,
+				  .work = all + 2 * pixels,
+				  .slopes = malloc(pixels * sizeof(*pair.slopes))};
 	bool found;
 
-	if (all == NULL)
+	if (all == NULL || pair.slopes == NULL) {
+		free(all);
+		free(pair.slopes);
 		return error_set(err, ERR_NO_MEMORY, "no memory for images of %d x %d", columns, rows);
+	}
 	image_detail(image, columns, rows, FINE, COARSE, pair.work, pair.image);
 	image_detail(other, columns, rows, FINE, COARSE, pair.work, pair.other);
 	ret_shift->unexplained = unexplained_share(&pair, image);
 	found = fit(&pair, ret_shift);
+	free(pair.slopes);
 	free(all);
 	return found;
 }
