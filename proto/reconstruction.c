@@ -30,6 +30,7 @@
 #include "proto/nifti.h"
 #include "proto/reference.h"
 #include "proto/refinement.h"
+#include "proto/refining_file.h"
 #include "proto/saver.h"
 #include "proto/seal.h"
 #include "proto/sums.h"
@@ -888,16 +889,26 @@ static uint64_t own_basis(const struct reconstruction *reconstruction, uint64_t 
 	return basis;
 }
 
+/* What is reached on the way is kept where iterations are: a daemon's job may end in its midst, and goes on later. */
 static int find_poses(struct reconstruction *reconstruction, struct refinement *ret_refinement, struct error *err)
 {
+	const double seconds = reconstruction->options->checkpoint_seconds;
+	const char *directory = reconstruction->run.directory;
 	struct refine_reference reference = {.voxels = NULL};
+	struct refining_file *file = NULL;
 	int code = read_reference(reconstruction, &reference, err);
 
+	if (code == 0 && reconstruction->run.sealed && seconds > 0)
+		code =
+		    refining_file_open(directory, own_basis(reconstruction, recon_refine_basis(reconstruction->recon)),
+				       seconds, &file, err);
 	if (code == 0)
-		code = recon_refine(reconstruction->recon, reference.voxels != NULL ? &reference : NULL, ret_refinement,
+		code = recon_refine(reconstruction->recon, reference.voxels != NULL ? &reference : NULL,
+				    file != NULL ? refining_file_keep(file) : NULL, ret_refinement,
 				    &reconstruction->poses, err);
 	if (code == 0)
 		ret_refinement->basis = own_basis(reconstruction, ret_refinement->basis);
+	refining_file_free(file);
 	free((void *)(uintptr_t)reference.voxels);
 	return code;
 }
@@ -942,6 +953,8 @@ static int heed_poses(struct reconstruction *reconstruction, bool *ret_again, st
 	reconstruction->refined = true;
 	*ret_again = refinement.accepted || reconstruction->resumed;
 	code = tell_refinement(reconstruction, &refinement, err);
+	if (code == 0)
+		refining_file_remove(reconstruction->run.directory);
 	if (code == 0 && run_yield(&reconstruction->run))
 		return error_set(err, ERR_BUSY, "yielded once the geometry was refined");
 	return code == 0 && *ret_again ? open_again(reconstruction, err) : code;

@@ -62,6 +62,20 @@ static void add_held_out(cJSON *json, const struct refinement *refinement)
 	cJSON_AddNumberToObject(held_out, "unexplained_after", refinement->held_after);
 }
 
+/* What the scan's own volume says of a reference's path. */
+static void add_own(cJSON *json, const struct refinement *refinement)
+{
+	cJSON *own;
+
+	if (refinement->own_before <= 0) {
+		cJSON_AddNullToObject(json, "own");
+		return;
+	}
+	own = cJSON_AddObjectToObject(json, "own");
+	cJSON_AddNumberToObject(own, "unexplained_before", refinement->own_before);
+	cJSON_AddNumberToObject(own, "unexplained_after", refinement->own_after);
+}
+
 static cJSON *path_json(const struct path *path)
 {
 	cJSON *json = cJSON_CreateObject();
@@ -87,6 +101,7 @@ cJSON *refined_json(const struct refined *refined)
 		cJSON_AddNumberToObject(json, "reference", refinement->alike);
 	else
 		cJSON_AddNullToObject(json, "reference");
+	add_own(json, refinement);
 	cJSON_AddNumberToObject(json, "rms_mm", refined->rms[0]);
 	cJSON_AddNumberToObject(json, "rms_deg", refined->rms[1]);
 	cJSON_AddNumberToObject(json, "most_mm", refined->most[0]);
@@ -147,6 +162,18 @@ static void held_out_parse(const cJSON *json, struct refinement *refinement, str
 	refinement->better = (int)better;
 }
 
+static void own_parse(const cJSON *json, struct refinement *refinement, struct json_reader *outer)
+{
+	struct json_reader reader;
+
+	if (json == NULL || cJSON_IsNull(json))
+		return;
+	json_begin(&reader, json, "/own", outer->err);
+	json_number(&reader, "unexplained_before", true, 0, LARGE, &refinement->own_before);
+	json_number(&reader, "unexplained_after", true, 0, LARGE, &refinement->own_after);
+	outer->code = outer->code != 0 ? outer->code : json_end(&reader);
+}
+
 int refinement_parse(const cJSON *json, struct refinement *ret_refinement, struct error *err)
 {
 	static const char *const others[] = {"kind", "rms_mm", "rms_deg", "most_mm", "most_deg", "views", "geometry"};
@@ -162,6 +189,7 @@ int refinement_parse(const cJSON *json, struct refinement *ret_refinement, struc
 	json_bool(&reader, "accepted", true, &refinement.accepted);
 	json_number(&reader, "reference", false, 0, LARGE, &refinement.alike);
 	held_out_parse(json_member(&reader, "held_out", true), &refinement, &reader);
+	own_parse(json_member(&reader, "own", false), &refinement, &reader);
 	json_string(&reader, "basis", false, basis, sizeof(basis));
 	path = json_member(&reader, "path", refinement.accepted);
 	code = json_end(&reader);
@@ -182,8 +210,11 @@ const char *refined_tell(const struct refined *refined, char *ret_detail, size_t
 		snprintf(
 		    ret_detail, size,
 		    "the reference's detail stands in %d views that were held out by a factor of %.2f (1: the same "
-		    "object); %d of them agree better with other poses",
-		    refinement->held_out, refinement->alike, refinement->better);
+		    "object); %d of them agree better with other poses, by which the scan's own volume leaves %.1f %% "
+		    "more "
+		    "of them unexplained",
+		    refinement->held_out, refinement->alike, refinement->better,
+		    100 * (refinement->own_after / refinement->own_before - 1));
 		return "not_refined";
 	}
 	if (!refinement->accepted) {

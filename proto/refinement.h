@@ -9,7 +9,8 @@
  * What a refinement has changed, as a document:
  *
  *   {"kind": "geometry" | "motion", "accepted", "held_out": {"views", "better", "unexplained_before",
- *    "unexplained_after"}, "reference": refinement.alike, or null, "rms_mm", "rms_deg", "most_mm", "most_deg",
+ *    "unexplained_after"}, "reference": refinement.alike, or null, "own": {"unexplained_before", "unexplained_after"},
+ *    or null without a reference, "rms_mm", "rms_deg", "most_mm", "most_deg",
  *    "views": [{"projection", "shift_mm": [3], "turn_deg": [3]}, ...], "geometry": matrices, or null, "basis"}
  *
  * Changes are those of refine_change. Where none was accepted `views` is empty. The geometry is the whole detector's,

@@ -361,29 +361,18 @@ uint64_t recon_refine_basis(struct recon *recon)
 	return recon->refining == NULL ? 0 : refining_basis(recon->refining, &recon->recipe, &recon->orbit);
 }
 
-/* Who asks between the steps of a refinement whether it goes on. */
-struct asking {
-	const struct recon *recon;
-	bool yields;
-};
-
-static bool must_leave(void *context)
+static bool must_yield(void *context)
 {
-	struct asking *asking = context;
-	const struct recon_hooks *hooks = asking->recon->hooks;
+	const struct recon_hooks *hooks = ((const struct recon *)context)->hooks;
 
-	if (hooks->cancelled != NULL && hooks->cancelled(hooks->context))
-		return true;
-	asking->yields = hooks->yield != NULL && hooks->yield(hooks->context);
-	return asking->yields;
+	return hooks->yield != NULL && hooks->yield(hooks->context);
 }
 
-int recon_refine(struct recon *recon, const struct refine_reference *reference, struct refinement *ret_refinement,
-		 struct geometry *ret_geometry, struct error *err)
+int recon_refine(struct recon *recon, const struct refine_reference *reference, const struct refine_keep *keep,
+		 struct refinement *ret_refinement, struct geometry *ret_geometry, struct error *err)
 {
-	struct asking asking = {.recon = recon};
-	const struct cancel leave = {must_leave, &asking};
-	const struct refine_watch watch = {&leave, tell_refining, recon};
+	const struct refine_watch watch = {
+	    .cancel = &recon->cancel, .progress = tell_refining, .yield = must_yield, .context = recon, .keep = keep};
 	const struct refine_device on = {recon->backend, recon->device};
 	const struct input *input = &recon->input;
 	struct refinement refinement = {.held_out = 0};
@@ -397,8 +386,6 @@ int recon_refine(struct recon *recon, const struct refine_reference *reference, 
 	if (recon->refining != NULL)
 		code = refining_find(recon->refining, &recon->recipe, &recon->orbit, &on, reference, &watch,
 				     &refinement, err);
-	if (code == ERR_CANCELLED && asking.yields)
-		code = error_set(err, ERR_BUSY, "yielded while the geometry was refined");
 	recon->work_done = recon->refine_from;
 	if (code == 0)
 		code = recon_refine_again(recon, &refinement, ret_geometry, err);

@@ -125,11 +125,12 @@ int recon_push(struct recon *recon, const void *samples, const int *views, int c
 /*
  * After the last view, where the recipe asks to refine the geometry: fits it (core/refine/refine.h). What is accepted
  * makes *ret_geometry, which a reconstruction opened anew goes by; free with geometry_clear. Where nothing was tried or
- * accepted it stays untouched, and this reconstruction goes on. reference: where the recipe names one, else NULL. The
- * same views give the same bits, so that a resumed run gets the geometry that its checkpoint was made with.
+ * accepted it stays untouched, and this reconstruction goes on. reference: where the recipe names one, else NULL; keep:
+ * who keeps what a run has reached that ends with ERR_BUSY, or breaks off; NULL: nobody. The same views give the same
+ * bits, so that a resumed run gets the geometry that its checkpoint was made with.
  */
-int recon_refine(struct recon *recon, const struct refine_reference *reference, struct refinement *ret_refinement,
-		 struct geometry *ret_geometry, struct error *err);
+int recon_refine(struct recon *recon, const struct refine_reference *reference, const struct refine_keep *keep,
+		 struct refinement *ret_refinement, struct geometry *ret_geometry, struct error *err);
 /* All but the reference that recon_refine would go by, as a number; refinement.basis of what was found has it. */
 uint64_t recon_refine_basis(struct recon *recon);
 /* In place of recon_refine where the same views have been refined before: goes by what was found then. */

@@ -13,6 +13,7 @@ static const double ARC_LEAST = 2.8;   /* radians */
 static const double KNOTS_APART = 0.7; /* radians, at first */
 /* What an iteration with TV, and a step of the path, take, in FDKs of the bins: for the progress bar. */
 enum { ITERATION_WORK = 5, STEP_WORK = 10 };
+enum { OWN_ITERATIONS = 6 }; /* of the scan's own volume, which is asked about a reference's path */
 /*
  * Iterations before the first step; steps with the same knots; how often these are doubled; and over how many bins what
  * the volume lacks is alike (registration_options).
@@ -39,6 +40,12 @@ static const double BETTER_VIEWS = 0.65, SIZE_LEAST = 0.055;
  * place, too.
  */
 static const double ALIKE_LEAST = 0.7;
+/*
+ * And by which share the scan's own volume may explain held-out views worse with a reference's path than without. Other
+ * objects' volumes that are alike enough made it .5 to 10 % worse where nothing was to be found, the object's own up to
+ * .23 %, which is noise.
+ */
+static const double OWN_WORSE = 0.003;
 
 struct run {
 	const struct refine_watch *watch;
@@ -47,6 +54,11 @@ struct run {
 	const struct refine_reference *reference;
 	struct grid grid;  /* of the coarser level's volumes, */
 	float *volumes[2]; /* without motion and with it; NULL on the first level */
+	size_t voxels[2];  /* in these */
+	struct refinement *refinement;
+	double sums[2];            /* of squares[] */
+	const struct path *placed; /* as the level's views stand; NULL: as the scan says */
+	int at, reached;           /* steps so far, and those that an earlier run has made */
 };
 
 bool refine_is_possible(const struct geometry *geometry, const struct orbit *orbit, bool is_referred)
@@ -184,6 +196,8 @@ static int count_updates(const struct reduced *reduced, const struct reduced *ha
 		options.empty = empty;
 		code = registration_updates(&options, &one, err);
 		updates += work_of(schedule_of(reduced, level, kind, is_referred), is_referred) * one;
+		if (is_referred && level == 0)
+			updates += 2 * OWN_ITERATIONS * ITERATION_WORK * one;
 	}
 	if (code == 0)
 		*ret_updates = updates;
@@ -202,6 +216,110 @@ int refine_work(const struct reduced *reduced, enum refine_kind kind, bool is_re
 	return code;
 }
 
+/* ---- what has been reached ---- */
+
+/* A change of what the bytes mean, or of the steps, is another version. */
+#define STATE_NAME "cbctd refining 1"
+struct state_head {
+	char name[24];
+	struct refinement refinement;
+	double sums[2];
+	int at, views;
+	size_t voxels[3]; /* of the level before without motion and with it, and of the level's own volume */
+};
+
+static size_t state_bytes(const struct state_head *head)
+{
+	return sizeof(*head) + 2 * (size_t)head->views * sizeof(double) +
+	       (head->voxels[0] + head->voxels[1] + head->voxels[2]) * sizeof(float);
+}
+
+static int keep_state(struct run *run, struct registration *fit, struct error *err)
+{
+	const size_t squares = (size_t)fit->reduced->geometry.count * sizeof(double);
+	struct state_head head;
+	int code = 0;
+
+	memset(&head, 0, sizeof(head));
+	memcpy(head.name, STATE_NAME, sizeof(STATE_NAME));
+	head.refinement = *run->refinement;
+	memcpy(head.sums, run->sums, sizeof(head.sums));
+	head.at = run->at;
+	head.views = fit->reduced->geometry.count;
+	for (int i = 0; i < 2; i++)
+		head.voxels[i] = run->volumes[i] != NULL ? run->voxels[i] : 0;
+	if (!fit->referred) {
+		head.voxels[2] = grid_voxels(&fit->grid);
+		code = fit->backend->volume_download(fit->volume, 0, fit->grid.size[2], fit->voxels, err);
+	}
+	if (code < 0)
+		return code;
+	return run->watch->keep->keep(run->watch->keep->context,
+				      &(struct refine_state){{{&head, sizeof(head)},
+							      {run->squares[0], squares},
+							      {run->squares[1], squares},
+							      {run->volumes[0], head.voxels[0] * sizeof(float)},
+							      {run->volumes[1], head.voxels[1] * sizeof(float)},
+							      {fit->voxels, head.voxels[2] * sizeof(float)}}},
+				      err);
+}
+
+/* The steps that an earlier run has made with the same views; 0: there is none that can be gone on from. */
+static int steps_made(const struct run *run, int views)
+{
+	const struct refine_keep *keep = run->watch == NULL ? NULL : run->watch->keep;
+	struct state_head head;
+
+	if (keep == NULL || keep->state == NULL || keep->bytes < sizeof(head))
+		return 0;
+	memcpy(&head, keep->state, sizeof(head));
+	return memcmp(head.name, STATE_NAME, sizeof(STATE_NAME)) == 0 && head.views == views &&
+		       head.refinement.basis == run->refinement->basis && state_bytes(&head) == keep->bytes
+		   ? head.at
+		   : 0;
+}
+
+/* Whether the volumes are of the grids of this level and the one before. */
+static bool fits_grids(const struct run *run, const struct registration *fit, const struct state_head *head)
+{
+	const struct grid *before = run->grid.size[0] > 0 ? &run->grid : &fit->grid;
+	bool fits = head->voxels[2] == (fit->referred ? 0 : grid_voxels(&fit->grid));
+
+	for (int i = 0; i < 2; i++)
+		fits = fits && (head->voxels[i] == 0 || head->voxels[i] == grid_voxels(before));
+	return fits;
+}
+
+/* Takes up where an earlier run has left off. ERR_DAMAGED: it was none of these views. */
+static int take_up(struct run *run, struct registration *fit, struct error *err)
+{
+	const char *from = run->watch->keep->state;
+	struct state_head head;
+	int code = 0;
+
+	memcpy(&head, from, sizeof(head));
+	from += sizeof(head);
+	if (!fits_grids(run, fit, &head))
+		return error_set(err, ERR_DAMAGED, "what a refinement has reached is of another grid");
+	*run->refinement = head.refinement;
+	memcpy(run->sums, head.sums, sizeof(run->sums));
+	for (int i = 0; i < 2; i++, from += (size_t)head.views * sizeof(double))
+		memcpy(run->squares[i], from, (size_t)head.views * sizeof(double));
+	for (int i = 0; i < 2; i++) {
+		free(run->volumes[i]);
+		run->voxels[i] = head.voxels[i];
+		run->volumes[i] = head.voxels[i] > 0 ? malloc(head.voxels[i] * sizeof(float)) : NULL;
+		if (head.voxels[i] > 0 && run->volumes[i] == NULL)
+			return error_set(err, ERR_NO_MEMORY, "no memory for a volume of %zu voxels", head.voxels[i]);
+		if (head.voxels[i] > 0)
+			memcpy(run->volumes[i], from, head.voxels[i] * sizeof(float));
+		from += head.voxels[i] * sizeof(float);
+	}
+	if (!fit->referred)
+		code = fit->backend->volume_upload(fit->volume, (const float *)(const void *)from, err);
+	return code == 0 ? registration_place(fit, run->placed, err) : code;
+}
+
 /* ---- one level ---- */
 
 static void tell_work(struct run *run, int fdks)
@@ -211,28 +329,71 @@ static void tell_work(struct run *run, int fdks)
 		run->watch->progress(run->watch->context, run->work_done / run->work_all);
 }
 
+static int place(struct run *run, struct registration *fit, const struct path *path, struct error *err)
+{
+	run->placed = path;
+	return registration_place(fit, path, err);
+}
+
+/* Counts a step; true where an earlier run has made it, and what it has reached there, or later, will be taken up. */
+static bool is_made(struct run *run)
+{
+	return ++run->at <= run->reached;
+}
+
+/* True once all that an earlier run has made is behind. */
+static bool is_caught_up(const struct run *run)
+{
+	return run->at >= run->reached;
+}
+
+/* Behind each step. */
+static int end_step(struct run *run, struct registration *fit, int fdks, struct error *err)
+{
+	const struct refine_watch *watch = run->watch;
+	bool yields;
+	int code = 0;
+
+	tell_work(run, fdks);
+	if (run->at == run->reached)
+		return take_up(run, fit, err);
+	if (run->at < run->reached || watch == NULL)
+		return 0;
+	yields = watch->yield != NULL && watch->yield(watch->context);
+	if (watch->keep != NULL && watch->keep->due(watch->keep->context, yields))
+		code = keep_state(run, fit, err);
+	return code == 0 && yields ? error_set(err, ERR_BUSY, "yielded while the geometry was refined") : code;
+}
+
 static int iterate(struct run *run, struct registration *fit, int count, struct error *err)
 {
 	int code = 0;
 
 	for (int i = 0; i < count && code == 0; i++) {
-		code = registration_iterate(fit, err);
-		tell_work(run, ITERATION_WORK);
+		if (!is_made(run))
+			code = registration_iterate(fit, err);
+		if (code == 0)
+			code = end_step(run, fit, ITERATION_WORK, err);
 	}
 	return code;
 }
 
-/* As many iterations as with a path that is looked for, from the coarser level's volume on. */
-static int run_still(struct run *run, struct registration *fit, const struct schedule *schedule, double *ret_sum,
-		     struct error *err)
+/* What the held-out views do not show: [0] without motion, [1] with it. */
+static int measure(struct run *run, struct registration *fit, int which, struct error *err)
 {
-	int code = registration_place(fit, NULL, err);
+	return is_caught_up(run) ? registration_measure(fit, run->squares[which], &run->sums[which], err) : 0;
+}
+
+/* As many iterations as with a path that is looked for, from the coarser level's volume on. */
+static int run_still(struct run *run, struct registration *fit, const struct schedule *schedule, struct error *err)
+{
+	int code = place(run, fit, NULL, err);
 
 	if (code == 0)
 		code = registration_start(fit, &run->grid, run->volumes[0], err);
 	if (code == 0)
 		code = iterate(run, fit, schedule->warm + schedule->steps * (1 + schedule->doublings), err);
-	return code == 0 ? registration_measure(fit, run->squares[0], ret_sum, err) : code;
+	return code == 0 ? measure(run, fit, 0, err) : code;
 }
 
 /* Steps of the path, and between them iterations of the volume where that is no reference. */
@@ -245,10 +406,13 @@ static int follow_path(struct run *run, struct registration *fit, const struct s
 		if (doubled > 0)
 			path_double(path);
 		for (int i = 0; i < schedule->steps && code == 0; i++) {
-			code = registration_step(fit, path, err);
-			tell_work(run, STEP_WORK);
+			if (!is_made(run)) {
+				code = registration_step(fit, path, err);
+				if (code == 0)
+					code = place(run, fit, path, err);
+			}
 			if (code == 0)
-				code = registration_place(fit, path, err);
+				code = end_step(run, fit, STEP_WORK, err);
 			if (code == 0 && run->reference == NULL)
 				code = iterate(run, fit, 1, err);
 		}
@@ -257,9 +421,9 @@ static int follow_path(struct run *run, struct registration *fit, const struct s
 }
 
 static int run_moved(struct run *run, struct registration *fit, const struct schedule *schedule, struct path *path,
-		     double *ret_sum, struct error *err)
+		     struct error *err)
 {
-	int code = registration_place(fit, path, err);
+	int code = place(run, fit, path, err);
 
 	if (code == 0)
 		code = registration_start(fit, &run->grid, run->volumes[1], err);
@@ -267,46 +431,48 @@ static int run_moved(struct run *run, struct registration *fit, const struct sch
 		code = iterate(run, fit, schedule->warm, err);
 	if (code == 0)
 		code = follow_path(run, fit, schedule, path, err);
-	return code == 0 ? registration_measure(fit, run->squares[1], ret_sum, err) : code;
+	return code == 0 ? measure(run, fit, 1, err) : code;
 }
 
 /* The same steps with a reference, which is there from the beginning. */
-static int run_referred(struct run *run, struct registration *fit, const struct schedule *schedule,
-			struct refinement *refinement, double ret_sums[2], struct error *err)
+static int run_referred(struct run *run, struct registration *fit, const struct schedule *schedule, struct error *err)
 {
-	struct path *path = &refinement->path;
-	int code = registration_place(fit, NULL, err);
+	struct refinement *refinement = run->refinement;
+	int code = place(run, fit, NULL, err);
 
 	if (code == 0)
 		code = registration_refer(fit, run->reference, err);
 	if (code == 0)
-		code = registration_measure(fit, run->squares[0], &ret_sums[0], err);
+		code = measure(run, fit, 0, err);
 	if (code == 0)
-		code = registration_place(fit, path, err);
+		code = place(run, fit, &refinement->path, err);
 	if (code == 0)
-		code = follow_path(run, fit, schedule, path, err);
+		code = follow_path(run, fit, schedule, &refinement->path, err);
 	if (code == 0)
-		code = registration_measure(fit, run->squares[1], &ret_sums[1], err);
-	return code == 0 ? registration_alike(fit, &refinement->alike, err) : code;
+		code = measure(run, fit, 1, err);
+	return code == 0 && is_caught_up(run) ? registration_alike(fit, &refinement->alike, err) : code;
 }
 
 static int keep_volume(struct run *run, struct registration *fit, int which, struct error *err)
 {
+	if (!is_caught_up(run))
+		return 0;
 	free(run->volumes[which]);
+	run->voxels[which] = grid_voxels(&fit->grid);
 	run->volumes[which] = registration_keep_volume(fit, err);
 	return run->volumes[which] == NULL ? err->code : 0;
 }
 
 /* From the volumes of the level before, and for the next one. */
 static int run_alone(struct run *run, struct registration *fit, const struct schedule *schedule, bool last,
-		     struct refinement *refinement, double ret_sums[2], struct error *err)
+		     struct error *err)
 {
-	int code = run_still(run, fit, schedule, &ret_sums[0], err);
+	int code = run_still(run, fit, schedule, err);
 
 	if (code == 0 && !last)
 		code = keep_volume(run, fit, 0, err);
 	if (code == 0)
-		code = run_moved(run, fit, schedule, &refinement->path, &ret_sums[1], err);
+		code = run_moved(run, fit, schedule, &run->refinement->path, err);
 	if (code == 0 && !last)
 		code = keep_volume(run, fit, 1, err);
 	run->grid = fit->grid;
@@ -324,18 +490,19 @@ static double size_of(const struct registration *fit, const struct refinement *r
 	return sqrt(squares);
 }
 
-/* Whether what a path explains better of the held-out views is worth it. bin: mm at the isocentre. */
-static void judge(const struct registration *fit, double *const squares[2], const double sums[2], double bin,
-		  struct refinement *refinement)
+/* Whether what a path explains better of the held-out views is worth it. */
+static void judge(const struct run *run, const struct registration *fit)
 {
+	const double bin = sqrt(fit->orbit.pixel_at_isocentre[0] * fit->orbit.pixel_at_isocentre[1]);
+	struct refinement *refinement = run->refinement;
 	const double values = registration_bins(fit);
 
 	refinement->held_out = fit->held_count;
-	refinement->held_before = sqrt(sums[0] / values);
-	refinement->held_after = sqrt(sums[1] / values);
+	refinement->held_before = sqrt(run->sums[0] / values);
+	refinement->held_after = sqrt(run->sums[1] / values);
 	refinement->better = 0;
 	for (int i = 0; i < fit->held_count; i++)
-		refinement->better += squares[1][i] < squares[0][i];
+		refinement->better += run->squares[1][i] < run->squares[0][i];
 	refinement->accepted = refinement->held_after < refinement->held_before * (1 - BETTER[fit->kind]) &&
 			       refinement->better >= BETTER_VIEWS * fit->held_count &&
 			       size_of(fit, refinement) > SIZE_LEAST * bin &&
@@ -343,10 +510,9 @@ static void judge(const struct registration *fit, double *const squares[2], cons
 }
 
 static int run_level(struct run *run, const struct registration_options *options, const struct schedule *schedule,
-		     bool last, struct refinement *refinement, struct error *err)
+		     bool last, struct error *err)
 {
 	struct registration fit;
-	double sums[2] = {0};
 	int code = registration_open(&fit, options, err);
 
 	if (code < 0)
@@ -354,12 +520,42 @@ static int run_level(struct run *run, const struct registration_options *options
 	run->unit = (double)grid_voxels(&fit.grid) * fit.geometry.count;
 	if (fit.held_count == 0 || fit.used_count < (fit.referred ? VIEWS_LEAST / 3 : VIEWS_LEAST / 2))
 		goto out;
-	code = fit.referred ? run_referred(run, &fit, schedule, refinement, sums, err)
-			    : run_alone(run, &fit, schedule, last, refinement, sums, err);
-	if (code == 0 && last)
-		judge(&fit, run->squares, sums, sqrt(fit.orbit.pixel_at_isocentre[0] * fit.orbit.pixel_at_isocentre[1]),
-		      refinement);
+	code = fit.referred ? run_referred(run, &fit, schedule, err) : run_alone(run, &fit, schedule, last, err);
+	if (code == 0 && is_caught_up(run) && last)
+		judge(run, &fit);
 out:
+	registration_clear(&fit);
+	return code;
+}
+
+/*
+ * What the scan's own volume says of a reference's path: views that are held out beside volumes of the others, as the
+ * scan has them and as the path moves them.
+ */
+static int ask_scan(struct run *run, const struct registration_options *options, struct error *err)
+{
+	struct refinement *refinement = run->refinement;
+	struct registration fit;
+	int code = registration_open(&fit, options, err);
+
+	if (code < 0)
+		return code;
+	run->unit = (double)grid_voxels(&fit.grid) * fit.geometry.count;
+	for (int i = 0; i < 2 && code == 0; i++) {
+		code = place(run, &fit, i == 0 ? NULL : &refinement->path, err);
+		if (code == 0)
+			code = registration_start(&fit, NULL, NULL, err);
+		if (code == 0)
+			code = iterate(run, &fit, OWN_ITERATIONS, err);
+		if (code == 0)
+			code = measure(run, &fit, i, err);
+		if (code == 0 && is_caught_up(run))
+			*(i == 0 ? &refinement->own_before : &refinement->own_after) =
+			    sqrt(run->sums[i] / registration_bins(&fit));
+	}
+	/* Held-out views of a displaced detector share next to nothing with those across, and cannot tell. */
+	if (code == 0 && !fit.orbit.displaced && !(refinement->own_after <= refinement->own_before * (1 + OWN_WORSE)))
+		refinement->accepted = false;
 	registration_clear(&fit);
 	return code;
 }
@@ -404,27 +600,48 @@ static struct path open_path(const struct orbit *orbit, enum refine_kind kind)
 	return path;
 }
 
-int refine_find(const struct reduced *reduced, const struct orbit *orbit, enum refine_kind kind, double mu_water,
-		const struct refine_device *on, const struct refine_reference *reference,
-		const struct refine_watch *watch, struct refinement *ret_refinement, struct error *err)
+/* With `reached` steps of an earlier run. */
+static int find_path(struct run *run, const struct reduced *reduced, const struct reduced *half,
+		     const struct orbit *orbit, enum refine_kind kind, double mu_water, const struct refine_device *on,
+		     struct error *err)
 {
-	struct refinement refinement = {.path = open_path(orbit, kind),
-					.basis = refine_basis(reduced, orbit, kind, mu_water)};
+	const bool is_referred = run->reference != NULL;
 	const int levels = levels_of(reduced);
-	struct reduced half = {0};
-	struct run run;
-	int code = open_run(&run, reduced, &half, kind, reference, watch, err);
+	int code = 0;
 
-	for (int level = 0; level < levels && code == 0; level++) {
-		struct registration_options options = options_of(reduced, &half, level, kind, reference != NULL);
+	for (int step = 0; step < levels + is_referred && code == 0; step++) {
+		const bool asks = step == levels;
+		const int level = asks ? 0 : step;
+		struct registration_options options = options_of(reduced, half, level, kind, is_referred && !asks);
 
 		options.on = on;
 		options.orbit = orbit;
 		options.mu_water = mu_water;
-		options.watch = watch;
-		code = run_level(&run, &options, schedule_of(reduced, level, kind, reference != NULL),
-				 level + 1 == levels, &refinement, err);
+		options.watch = run->watch;
+		code = asks ? ask_scan(run, &options, err)
+			    : run_level(run, &options, schedule_of(reduced, level, kind, is_referred),
+					level + 1 == levels, err);
 	}
+	return code;
+}
+
+/* From where an earlier run has left off, if `goes_on`; *ret_went: there was such a run. */
+static int find(const struct reduced *reduced, const struct orbit *orbit, enum refine_kind kind, double mu_water,
+		const struct refine_device *on, const struct refine_reference *reference,
+		const struct refine_watch *watch, bool goes_on, bool *ret_went, struct refinement *ret_refinement,
+		struct error *err)
+{
+	struct refinement refinement = {.path = open_path(orbit, kind),
+					.basis = refine_basis(reduced, orbit, kind, mu_water)};
+	struct reduced half = {0};
+	struct run run;
+	int code = open_run(&run, reduced, &half, kind, reference, watch, err);
+
+	run.refinement = &refinement;
+	run.reached = code == 0 && goes_on ? steps_made(&run, reduced->geometry.count) : 0;
+	*ret_went = run.reached > 0;
+	if (code == 0)
+		code = find_path(&run, reduced, &half, orbit, kind, mu_water, on, err);
 	if (!refinement.accepted)
 		refinement.path = open_path(orbit, kind);
 	close_run(&run);
@@ -432,4 +649,17 @@ int refine_find(const struct reduced *reduced, const struct orbit *orbit, enum r
 	if (code == 0)
 		*ret_refinement = refinement;
 	return code;
+}
+
+int refine_find(const struct reduced *reduced, const struct orbit *orbit, enum refine_kind kind, double mu_water,
+		const struct refine_device *on, const struct refine_reference *reference,
+		const struct refine_watch *watch, struct refinement *ret_refinement, struct error *err)
+{
+	bool went;
+	int code = find(reduced, orbit, kind, mu_water, on, reference, watch, true, &went, ret_refinement, err);
+
+	/* Nothing else here says damaged. */
+	return code == ERR_DAMAGED && went
+		   ? find(reduced, orbit, kind, mu_water, on, reference, watch, false, &went, ret_refinement, err)
+		   : code;
 }

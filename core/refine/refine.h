@@ -27,7 +27,8 @@
  *
  * A volume of the same object in the same world, of an earlier scan, can be the reference: then no volume is made, the
  * views are registered with it as it is, and what they share is found, too. A reference whose detail the views that are
- * held out do not show is of another object, and is not followed.
+ * held out do not show is of another object, and is not followed; nor is one by whose path the scan contradicts itself:
+ * views that are held out then agree worse with a volume of the scan's own others than they do as the scan has them.
  *
  * Without a reference what all views share is no motion. Nor does a scan tell how large the object is: the way along
  * the beam is expected to be small. Bins limit what can be found, to about a thirtieth of one.
@@ -55,8 +56,11 @@ struct refinement {
 	int held_out; /* views, */
 	/* and the root mean square of their detail that is unexplained, without and with the path, kept or not */
 	double held_before, held_after;
-	int better;     /* views among them that are explained better */
-	double alike;   /* of a reference's projections the share that the views' detail has, 1: the same; else 0 */
+	int better;   /* views among them that are explained better */
+	double alike; /* of a reference's projections the share that the views' detail has, 1: the same; else 0 */
+	/* With a reference what the scan's own volume leaves unexplained of the views held out, in the coarser bins;
+	 * else 0. */
+	double own_before, own_after;
 	uint64_t basis; /* refine_basis */
 };
 
@@ -98,11 +102,39 @@ int refine_bytes(const struct reduced *reduced, const struct refine_device *on, 
 int refine_work(const struct reduced *reduced, enum refine_kind kind, bool is_referred, double *ret_updates,
 		struct error *err);
 
+/*
+ * What a refinement has reached behind a step, in pieces that follow each other in a file; borrowed for the call. Such
+ * bytes, whole, are what another run of the same views goes on from.
+ */
+enum { REFINE_PIECES = 6 };
+struct refine_state {
+	struct refine_piece {
+		const void *bytes;
+		size_t size; /* 0: it is left out */
+	} pieces[REFINE_PIECES];
+};
+/*
+ * Who keeps what was reached. A run that goes on from there ends with the bits of one that was never broken off, on the
+ * same backend.
+ */
+struct refine_keep {
+	void *context;
+	bool (*due)(void *context,
+		    bool leaves); /* asked behind each step; leaves: the run ends there, to go on later */
+	int (*keep)(void *context, const struct refine_state *state, struct error *err);
+	/* What an earlier run has kept, all of it; NULL: there is none. That of other views, or no whole state: as
+	 * none. */
+	const void *state;
+	size_t bytes;
+};
+
 /* Who watches it. */
 struct refine_watch {
 	const struct cancel *cancel;                   /* NULL: nobody can cancel it */
 	void (*progress)(void *context, double share); /* behind each step: the share of all of them that is done */
+	bool (*yield)(void *context); /* asked behind each step, NULL: nobody asks; true: ends with ERR_BUSY there */
 	void *context;
+	const struct refine_keep *keep; /* NULL: what was reached is not kept */
 };
 /*
  * orbit: of the scan. mu_water in 1/mm. reference: NULL for none. On one backend the same bits for any number of

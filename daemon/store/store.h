@@ -26,7 +26,7 @@
  *   STATE/catalogue.postgresql  the name of the schema of a PostgreSQL database that has them
  *   STATE/scans/ID/         scan.json projections.raw flat.f32 dark.f32 defects.u8 (proto/scan_directory.h)
  *                           projections.sums (proto/sums.h)
- *   STATE/jobs/ID/          NAME.nii, checkpoint.f32, annotations.json, refinement.json
+ *   STATE/jobs/ID/          NAME.nii, checkpoint.f32, annotations.json, refinement.json, refining
  *   STATE/{scans,jobs}/ID/record.json  its rows of the catalogue (store/record.h)
  *
  * The directories are the truth, the catalogue is their index: what it lacks is found again in them

@@ -61,9 +61,13 @@ test_an_arm_that_wanders_is_followed_and_gone_on_with() {
 	wait_job succeeded
 	told geometry_refined
 	first=$(digest)
-	# A job that yields finds the same poses again, and ends with the same bits.
+	# A job that yields amid its refinement and behind it goes on, and ends with the same bits.
 	post_job "$recipe$iterations"
 	yielded=$job
+	until req GET "/v1/jobs/$job" && jq -e '.state == "running"' "$body" >/dev/null; do sleep 0.02; done
+	post_job "$recipe"'"fdk": {}, "priority": "stat"}'
+	wait_job succeeded
+	job=$yielded
 	until req GET "/v1/jobs/$job" && jq -e '.iteration >= 2' "$body" >/dev/null; do sleep 0.02; done
 	post_job "$recipe"'"fdk": {}, "priority": "stat"}'
 	wait_job succeeded
@@ -71,6 +75,7 @@ test_an_arm_that_wanders_is_followed_and_gone_on_with() {
 	wait_job succeeded
 	told geometry_refined
 	[ "$(digest)" = "$first" ] || fail "the digest of the undisturbed run"
+	[ ! -e "$state/jobs/$job/refining" ] || fail "what a refinement has reached stays behind its end"
 }
 
 # rmse_of SCAN: error of its FDK volume against the head's truth
