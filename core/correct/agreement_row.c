@@ -152,7 +152,7 @@ static int warn(const struct correction_job *job, void *opaque, struct error *er
 	for (int i = 0; i < job->input->counts.blank; i++)
 		reduced_leave_out(&state->reduced, job->input->blank[i]);
 	for (int i = 0; i < job->input->mended_count; i++)
-		if (job->input->steps[job->input->mended[i]].kind != STEP_LEVEL)
+		if (steps_can_mend(&job->input->steps[job->input->mended[i]]))
 			reduced_leave_out(&state->reduced, job->input->mended[i]);
 	code = agreement_measure(&state->reduced, job->cancel, &agreement, err);
 	if (code < 0)

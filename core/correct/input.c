@@ -111,14 +111,16 @@ int input_open(struct input *ret_input, const struct linearise *linearise, const
 		input.content = calloc((size_t)geometry->count, sizeof(*input.content));
 		input.profiles = calloc((size_t)geometry->count, sizeof(*input.profiles));
 		input.strips = calloc((size_t)geometry->count, sizeof(*input.strips));
+		input.all_views = geometry->count;
+		input.impulses = calloc((size_t)geometry->count, sizeof(*input.impulses));
 		input.outliers = calloc((size_t)geometry->count, sizeof(*input.outliers));
 		input.steps = calloc((size_t)geometry->count, sizeof(*input.steps));
 		input.mended = calloc((size_t)geometry->count, sizeof(*input.mended));
 		input.defects = calloc((size_t)geometry->count, sizeof(*input.defects));
 		input.edges = calloc((size_t)geometry->count, sizeof(*input.edges));
 		if (input.blank == NULL || input.content == NULL || input.profiles == NULL || input.strips == NULL ||
-		    input.outliers == NULL || input.steps == NULL || input.mended == NULL || input.defects == NULL ||
-		    input.edges == NULL)
+		    input.impulses == NULL || input.outliers == NULL || input.steps == NULL || input.mended == NULL ||
+		    input.defects == NULL || input.edges == NULL)
 			code = error_set(err, ERR_NO_MEMORY, "no memory for a list of %d views", geometry->count);
 	}
 	if (code < 0)
@@ -148,6 +150,9 @@ void input_clear(struct input *input)
 	free(input->profiles);
 	free(input->strips);
 	free(input->outliers);
+	for (int i = 0; i < input->all_views && input->impulses != NULL; i++)
+		free(input->impulses[i].pixels);
+	free(input->impulses);
 	free(input->steps);
 	free(input->mended);
 	free(input->defects);
@@ -318,7 +323,7 @@ static void add_edges(struct input *input, int views)
 	for (int view = 0; view < views; view++) {
 		const struct view_edges *edges = &input->edges[view];
 
-		if (!edges->looked_at || input_is_mended(input, view))
+		if (!edges->looked_at || (input_is_mended(input, view) && input->steps[view].kind != STEP_NONE))
 			continue;
 		input->views_looked_at++;
 		for (int end = 0; end < 2; end++)
@@ -409,6 +414,9 @@ int input_take(struct input *input, const struct backend *backend, struct plan *
 		code = input_empty_slot(input, backend, to, slot, err);
 	} else if (counts.blank == 0) {
 		code = look_at_all(input, samples, columns, rows, &input->content[view], err);
+		if (code == 0)
+			code = impulses_look(&input->linearise, samples, (const int[2]){columns, rows},
+					     &input->impulses[view], err);
 	}
 	if (code == 0 && view % input->look_every == 0)
 		code = look_at_ends(input, samples, columns, rows, &input->edges[view], err);
@@ -618,7 +626,8 @@ bool input_lacks(const struct input *input, int views)
 	bool lacks = input_kept_in(input, views) > 0;
 
 	for (int view = 0; view < views; view++)
-		lacks = lacks || (steps_can_mend(&input->steps[view]) && !input_is_mended(input, view));
+		lacks = lacks || input->impulses[view].count > 0 ||
+			(steps_can_mend(&input->steps[view]) && !input_is_mended(input, view));
 	return lacks;
 }
 
@@ -646,12 +655,14 @@ int input_mend(struct input *input, const struct backend *backend, struct stack 
 	if (bad == NULL || parts == NULL)
 		code = error_set(err, ERR_NO_MEMORY, "no memory for a list of %d views", orbit->count);
 	if (code == 0 && keeps_all)
+		code = input_mend_impulses(input, &tools, err);
+	if (code == 0 && keeps_all)
 		code = mend_places(&tools, input->steps, err);
 	for (int i = 0; i < input->mended_count && code == 0; i++) {
 		const int view = input->mended[i];
 		const struct step *step = &input->steps[view];
 
-		if (step->kind == STEP_MISPLACED)
+		if (step->kind == STEP_MISPLACED || step->kind == STEP_NONE)
 			continue;
 		if (step->kind == STEP_PART) {
 			bad[view] = true;

@@ -4,6 +4,7 @@
 #include "core/correct/binning.h"
 #include "core/correct/content.h"
 #include "core/correct/defects.h"
+#include "core/correct/impulses.h"
 #include "core/correct/mend.h"
 #include "core/correct/narrow.h"
 #include "core/correct/outliers.h"
@@ -33,6 +34,11 @@ struct input {
 	struct view_profile *profiles;
 	struct view_strips *strips;
 	struct outlier *outliers;
+	/* [all_views], owned, as their pixels: single samples that may be wrong, behind input_check those that are; and
+	 * what was replaced, behind input_mend. */
+	struct view_impulses *impulses;
+	int all_views, replaced_views;
+	size_t replaced;
 	/*
 	 * [views of the scan], owned, of input_settle: runs between two steps, and [mended_count] those of their views
 	 * that are made whole again. Such a view is an outlier as well, and none of the blank ones.
@@ -130,6 +136,14 @@ int input_settle(struct input *input, const struct orbit *orbit, bool keeps_all,
 bool input_lacks(const struct input *input, int views);
 /* Outliers that are neither mended nor left out. */
 int input_kept_in(const struct input *input, int views);
+
+/* Behind input_settle of a job that keeps all projections: single samples of them that are wrong are to be mended, too.
+ */
+int input_check(struct input *input, const struct backend *backend, struct stack *projections,
+		const struct geometry *geometry, const struct orbit *orbit, const struct cancel *cancel,
+		struct error *err);
+/* The part of input_mend that replaces those. */
+int input_mend_impulses(struct input *input, const struct mend_tools *tools, struct error *err);
 
 /*
  * Makes the views that are to be mended whole in `projections`, which keeps all views where keeps_all; otherwise the

@@ -3,6 +3,7 @@
  * what the samples themselves give reason to doubt. Here is what is refused and what has to be said of them.
  */
 #include <math.h>
+#include <stdio.h>
 
 #include "core/correct/correction.h"
 #include "core/correct/images.h"
@@ -133,12 +134,20 @@ const struct correction correction_hardening = {
 
 /* ---- defects ---- */
 
+/* A view that has both kinds may be counted twice, but no view more than there are. */
+static int defective_views(const struct input *input)
+{
+	const int views = input->defective_views + input->replaced_views;
+
+	return views < input->views ? views : input->views;
+}
+
 static int warn_of_defects(const struct correction_job *job, void *state, struct error *err)
 {
 	const struct input *input = job->input;
 	const struct defect_counts *counts = &input->counts;
 	const struct defect_map *map = &input->map;
-	const size_t found = defects_total(counts) - counts->mapped;
+	const size_t found = defects_total(counts) - counts->mapped + input->replaced;
 	const size_t mapped = map->given + map->dead + map->hot + map->noisy;
 	const struct binning *binning = &input->binning;
 	const double samples = (double)input->pixels * input->views;
@@ -146,8 +155,13 @@ static int warn_of_defects(const struct correction_job *job, void *state, struct
 	const char *fate =
 	    binning->n == 1 ? "replaced from their neighbours" : "left out of the blocks of binned pixels";
 
+	char single[96] = "";
+
 	(void)state;
 	(void)err;
+	if (input->replaced > 0)
+		snprintf(single, sizeof(single), ", %zu unlike all around them and in the projections beside",
+			 input->replaced);
 	if (mapped > 0)
 		warning_tell(job->warnings, "defect_map",
 			     "%zu pixels (%.3g %%) of every projection were %s: %zu of the given "
@@ -164,9 +178,9 @@ static int warn_of_defects(const struct correction_job *job, void *state, struct
 		warning_tell(
 		    job->warnings, "defects",
 		    "%zu samples (%.3g %%) in %d projections were replaced from their neighbours: %zu not above the "
-		    "dark, %zu saturated, %zu not finite or without a flat",
-		    found, 100 * (double)found / samples, input->defective_views, counts->zero, counts->saturated,
-		    counts->not_finite);
+		    "dark, %zu saturated, %zu not finite or without a flat%s",
+		    found, 100 * (double)found / samples, defective_views(input), counts->zero, counts->saturated,
+		    counts->not_finite, single);
 	return 0;
 }
 

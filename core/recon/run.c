@@ -372,11 +372,15 @@ static int leave_out(struct recon *recon, struct error *err)
 {
 	struct input *input = &recon->input;
 	const bool keeps = keeps_projections(&recon->recipe);
-	int code = settle(recon, err);
-	const int found = recon->left_out, mended = input->mended_count;
-	const int *views = input->blank + input->counts.blank - found;
-	int *spoiled = NULL;
+	int code = settle(recon, err), found, mended, *spoiled = NULL;
+	const int *views;
 
+	if (code == 0 && keeps)
+		code = input_check(input, recon->backend, recon->projections, recon->geometry, &recon->orbit,
+				   &recon->cancel, err);
+	found = recon->left_out;
+	mended = input->mended_count;
+	views = input->blank + input->counts.blank - found;
 	if (code == 0 && found + mended > 0 && recon_runs_fdk(recon)) {
 		spoiled = malloc((size_t)(found + mended) * sizeof(*spoiled));
 		if (spoiled == NULL)
