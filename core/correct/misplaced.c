@@ -10,10 +10,11 @@
 enum { BESIDE_MOST = 3 }; /* places up to the next one that is in */
 enum { AROUND = 10, USUAL_LEAST = 4, VIEWS_LEAST = 24, PIECES_MOST = 96, PIXELS_LEAST = 16, SINGLES_MOST = 4 };
 /* Squares, of what is usual about there: cuts, a join; a single view at its own place, and at another one. */
-static const double CUTS[] = {5, 3, 2}, JOINS = 3, OFF = 6, FITS = 3;
+static const double CUT = 5, SMALLEST_CUT = 1.5, JOINS = 3, OFF = 6, FITS = 3;
 static const double BETTER = 4; /* times a single view fits better elsewhere */
 static const double SURE = 2;   /* times as much where no other one's place is free for it */
-enum { MOST = 2 };              /* one view in so many */
+enum { TRIES = 16 };
+enum { MOST = 2 }; /* one view in so many */
 
 /* The views that stand in a row along the ring. */
 struct search {
@@ -232,10 +233,22 @@ static int find_order_of(const struct search *search, double cut)
 	return moved;
 }
 
-/* Where views far from each other look alike, a cut between them is small. */
+/* The largest step that is no cut of this size, as a cut; 0: there is none. */
+static double next_cut(const struct search *search, double cut)
+{
+	double next = 0;
+
+	for (int i = 0; i < search->ring->count; i++)
+		if (!is_cut(search, i, cut))
+			next = fmax(next, search->apart[i] / search->usual[i]);
+	return next * (1 - 1e-9);
+}
+
+/* Where views far from each other look alike, a cut between them is small: smaller ones are added one by one. */
 static void find_order(const struct search *search)
 {
 	const int count = search->ring->count;
+	double size = CUT;
 	bool cut = false;
 
 	for (int i = 0; i < count; i++)
@@ -245,10 +258,12 @@ static void find_order(const struct search *search)
 					     fmax(1, pow(ring_turn(search->ring, i, (i + 1) % count) / search->gap, 2));
 	make_usual(search, search->apart, search->usual);
 	for (int i = 0; i < count; i++)
-		cut = cut || (!is_fixed(search->ring, i) && is_cut(search, i, CUTS[0]));
-	for (size_t i = 0; i < sizeof(CUTS) / sizeof(*CUTS) && cut; i++)
-		if (find_order_of(search, CUTS[i]) > 0)
+		cut = cut || (!is_fixed(search->ring, i) && is_cut(search, i, CUT));
+	for (int tries = 0; tries < TRIES && cut && size > SMALLEST_CUT; tries++) {
+		if (find_order_of(search, size) > 0)
 			return;
+		size = next_cut(search, size);
+	}
 }
 
 /* ---- single views ---- */

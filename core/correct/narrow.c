@@ -10,7 +10,7 @@
 enum { STRIPS = NARROW_STRIPS, SAMPLES = NARROW_SAMPLES };
 enum { PIXELS_LEAST = 16 };
 enum { WIDTH_LEAST = 2, WIDEST = 4 }; /* samples; one in so many */
-enum { EDGE = 4 };                    /* samples between a band and the detector's edge, at least */
+enum { EDGE = 4, EDGE_VIEWS = 3 };    /* samples from the detector's edge within which a band has so many views */
 enum { BORDER = 1 };                  /* samples at a border that may be of either side */
 enum { BESIDE = 4 };                  /* samples on either side that a band stands out of, at least */
 enum { AROUND = 3 };                  /* pairs of views on either side that tell what the object does */
@@ -248,16 +248,25 @@ static bool has_other(const struct change *change, int samples, const struct ban
 	return false;
 }
 
-/* True if the change begins and ends from one sample to the next, or within one at the border of a wider band. */
-static bool is_sharp(const struct change *change, const struct band *band)
+/* True if the change begins and ends from one sample to the next, or within one at the border of a wider band; at the
+ * detector's edge it has no border. */
+static bool is_sharp(const struct change *change, int samples, const struct band *band)
 {
 	const int apart = band->end - band->first > 3 ? 1 : 0;
-	const float in[2] = {change->mean[band->first + apart], change->mean[band->end - 1 - apart]};
-	const float out[2] = {change->mean[band->first - 1 - apart], change->mean[band->end + apart]};
 
-	for (int side = 0; side < 2; side++)
-		if ((in[side] - out[side]) / band->step < SHARP)
+	for (int side = 0; side < 2; side++) {
+		const int in = side == 0 ? band->first + apart : band->end - 1 - apart;
+		const int out = side == 0 ? band->first - 1 - apart : band->end + apart;
+
+		if (side == 0 ? band->first == 0 : band->end == samples)
+			continue;
+		if ((change->mean[in] - change->mean[out < 0         ? 0
+						     : out < samples ? out
+								     : samples - 1]) /
+			band->step <
+		    SHARP)
 			return false;
+	}
 	return true;
 }
 
@@ -271,7 +280,7 @@ static bool is_box(const struct change *change, int samples, const struct band *
 	float lost = 0;
 	int strays = 0;
 
-	if (noise > NOISY * size || !is_sharp(change, band))
+	if (noise > NOISY * size || !is_sharp(change, samples, band))
 		return false;
 	for (int i = 0; i < samples; i++) {
 		const float own = change->mean[i];
@@ -387,6 +396,15 @@ static void keep_seed(struct band seeds[SEEDS], float scores[SEEDS], const struc
 	}
 }
 
+/*
+ * What enters at the detector's edge for a moment may be an object, and what is away for a moment as well: there a band
+ * steps in more views than that, and has lost signal.
+ */
+static bool is_at_edge(const struct band *band, int samples)
+{
+	return band->first < EDGE || band->end + EDGE > samples;
+}
+
 /* The bands that stand out most of a change; a step of 0: none. */
 static void find_seeds(const struct change *change, int samples, struct band ret_seeds[SEEDS])
 {
@@ -399,13 +417,16 @@ static void find_seeds(const struct change *change, int samples, struct band ret
 		sums.sum[i + 1] = sums.sum[i] + (isnan(change->mean[i]) ? 0 : change->mean[i]);
 		sums.count[i + 1] = sums.count[i] + !isnan(change->mean[i]);
 	}
-	for (int first = EDGE; first + WIDTH_LEAST + EDGE <= samples; first++)
-		for (int end = first + WIDTH_LEAST; end + EDGE <= samples && WIDEST * (end - first) <= samples; end++) {
+	for (int first = 0; first + WIDTH_LEAST <= samples; first++)
+		for (int end = first + WIDTH_LEAST; end <= samples && WIDEST * (end - first) <= samples; end++) {
 			struct band band = {first, end, 0};
 
 			if (!(fabsf(mean_between(&sums, first, end)) >= 0.5f * LEAST))
 				continue;
 			band.step = contrast_between(&sums, samples, &band);
+			/* Little lies beside it there: what does is no band because that one is. */
+			if (is_at_edge(&band, samples) && mean_between(&sums, first, end) / band.step < 0.5f)
+				continue;
 			if (fabsf(band.step) >= LEAST)
 				keep_seed(ret_seeds, scores, &band);
 		}
@@ -468,6 +489,15 @@ static bool is_known(const struct band *bands, int count, const struct band *ban
 	return false;
 }
 
+/* How many views of a run are darker; far below 0: they are brighter. */
+static int count_views(void *context, int before, int last)
+{
+	const struct marking *marking = context;
+	const int count = marking->search->ring->count;
+
+	return marking->search->steps[before] > 0 ? (last - before + count) % count : -count;
+}
+
 /* The runs of bands that may step at a place and were not looked at yet. */
 static int look_at(const struct search *search, int place, enum trend trend, struct band *known, int *ret_count)
 {
@@ -485,6 +515,9 @@ static int look_at(const struct search *search, int place, enum trend trend, str
 			continue;
 		known[(*ret_count)++] = *band;
 		find_steps(search, band, search->steps);
+		if (is_at_edge(band, search->samples) &&
+		    ring_runs(search->ring, search->steps, count_views, &(struct marking){search, band}) < EDGE_VIEWS)
+			continue;
 		found += ring_runs(search->ring, search->steps, mark, &(struct marking){search, band});
 	}
 	return found;

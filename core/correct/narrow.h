@@ -10,7 +10,8 @@
  * to four times as many, each of one column or row. From a view to the next such a band steps in all strips along it,
  * and against what lies beside it; nothing else does as much anywhere in the profile. An object cannot come from
  * nowhere: a rod has left another place, and a plate that is seen from its edge has been beside it, so that what lies
- * beside has lost what the band has got.
+ * beside has lost what the band has got. At the detector's edge objects do come from nowhere: a band there is darker,
+ * and in three views at least.
  */
 enum { NARROW_STRIPS = 8, NARROW_LINES = 3, NARROW_SAMPLES = 256 };
 

@@ -229,6 +229,12 @@ START_TEST(narrow_bands_are_found)
 	    {1, 90, 93, .69, 4, 20, 1, 1, 0},
 	    {1, 40, 60, .36, 4, 30, 18, 18, 0},
 	    {1, 90, 93, 2.3, 6, 20, 18, 18, 1.5},
+	    {0, 0, 6, .69, 4, 20, 18, 18, 0}, /* at the detector's edge */
+	    {0, 296, 300, 2.3, 4, 30, 4, 4, 0},
+	    {0, 3, 10, .69, 4, 80, 18, 18, 0},
+	    {1, 197, 200, 2.3, 4, 30, 18, 18, .3},
+	    {0, 0, 6, .69, 4, 20, 1, 0, 0},      /* an object may have entered there for a moment, */
+	    {0, 0, 6, -2.3, 4, 20, 10, 0, 0},    /* or been away */
 	    {0, 120, 126, .1, 4, 20, 18, 0, 0},  /* less than is told */
 	    {0, 120, 126, .69, 4, 20, 40, 0, 0}, /* over 160 degrees */
 	    {0, 120, 126, .69, 12, 20, 4, 0, 0}, /* views that are too far apart */
@@ -713,10 +719,11 @@ Suite *content_suite(void)
 	Suite *suite = suite_create("content");
 	TCase *search = tcase_create("search"), *tests = tcase_create("content");
 
+	tcase_set_timeout(search, 60);
 	tcase_set_timeout(tests, 60);
 	tcase_add_loop_test(search, a_gap_among_views_of_an_object_is_found, 0, 2);
 	tcase_add_loop_test(search, views_between_two_steps_are_found, 0, 23);
-	tcase_add_loop_test(search, narrow_bands_are_found, 0, 14);
+	tcase_add_loop_test(search, narrow_bands_are_found, 0, 20);
 	tcase_add_loop_test(search, runs_of_views_that_lie_aside_are_found, 0, 9);
 	tcase_add_loop_test(tests, views_that_show_nothing_are_told_and_left_out, 0, TRIES);
 	tcase_add_loop_test(tests, views_that_do_not_follow_are_told_and_left_out, 0, 2 * OUTLYING);
