@@ -194,8 +194,12 @@ $(BUILD)/cbctd-without-postgresql: $(filter-out $(BUILD)/daemon/store/postgresql
 
 gpu_programs := $(BUILD)/gpu_check $(BUILD)/gpu_bench $(BUILD)/gpu_cards $(BUILD)/gpu_large
 # Every program that a test or a benchmark runs, so that none stops compiling unseen.
-test-programs: $(addprefix $(BUILD)/,unit cbct-worker-held cbctd-held cbctd-without-postgresql manual faults.so clock.so every.so live_bytes.so simulated-nvml/libnvidia-ml.so.1 cpu-bench calibrate-bench agreement refine denoise presets stopping methods watchers slices acquire paper-project rabbitct $(if $(postgresql),claims)) \
+test-programs: $(addprefix $(BUILD)/,unit member cbct-worker-held cbctd-held cbctd-without-postgresql manual faults.so clock.so every.so live_bytes.so simulated-nvml/libnvidia-ml.so.1 cpu-bench calibrate-bench agreement refine denoise presets stopping methods watchers slices acquire paper-project rabbitct $(if $(postgresql),claims)) \
                $(if $(cuda_objects),$(gpu_programs) $(BUILD)/gpu_ceilings $(BUILD)/cbct-worker-faulty,$(call objects,$(wildcard tests/bench/gpu_*.c)))
+
+# What tests ask of JSON documents by the thousand.
+$(BUILD)/member: tests/http/member.c
+	$(call say,CC  )$(CC) -std=c11 -D_GNU_SOURCE -O1 $(WARN) $(call pkg,--cflags,libcjson) -o $@ $< $(call pkg,--libs,libcjson)
 
 # Faults of the disk, loaded into the programs by tests.
 $(BUILD)/faults.so: tests/http/faults.c

@@ -36,7 +36,7 @@ test_a_sagging_arm_is_calibrated_and_its_scans_use_it() {
 	start_daemon
 	balls
 	calibrated
-	jq -e '.state == "succeeded" and .used == 24 and .residual_pixels < .2 and .residual_isocentre_mm < .1 and .arm == "arm in room 2" and
+	member '.state == "succeeded" and .used == 24 and .residual_pixels < .2 and .residual_isocentre_mm < .1 and .arm == "arm in room 2" and
 		.sweep.views == 24 and .detector.columns == 300 and .age_s >= 0 and (.geometry.matrices | length) == 24 and
 		(.views | length) == 24 and all(.views[]; .used and .balls >= 7)' "$body" >/dev/null || fail "a result: $(head -c 900 "$body")"
 	jq -c .geometry.matrices "$body" >"$work/matrices"
@@ -53,14 +53,14 @@ test_a_sagging_arm_is_calibrated_and_its_scans_use_it() {
 	jq -e --slurpfile found "$work/matrices" '[.geometry.matrices, $found[0] | map(map(. * 1))] | transpose |
 		all(.[0] as $a | .[1] as $b | [range(12) | ($a[.] / $a[11] - $b[.] / $b[11]) | fabs] | max < 1e-6)' "$body" >/dev/null ||
 		fail "the calibration's matrices in the scan"
-	jq -e '.geometry.kind == "calibration" and .warnings == []' "$body" >/dev/null || jq -e '[.warnings[].code] | index("calibration_interpolated") | not' "$body" >/dev/null ||
+	member '.geometry.kind == "calibration" and .warnings == []' "$body" >/dev/null || member '[.warnings[].code] | index("calibration_interpolated") | not' "$body" >/dev/null ||
 		fail "no word of interpolation: $(jq -c .warnings "$body")"
 
 	# other views of the same sweep, by their angles
 	scan "{\"kind\": \"calibration\", \"id\": \"$calibration\", \"first_angle_deg\": 3, \"angle_step_deg\": 10}" 36
 	expect_status 201
 	expect_warning calibration_interpolated
-	jq -e '(.geometry.matrices | length) == 36' "$body" >/dev/null || fail "36 matrices"
+	member '(.geometry.matrices | length) == 36' "$body" >/dev/null || fail "36 matrices"
 	scan "{\"kind\": \"calibration\", \"id\": \"$calibration\"}" 36
 	expect_status 422
 	expect_json '.pointer == "/geometry/angles_deg"'
@@ -104,7 +104,7 @@ test_a_sagging_arm_is_calibrated_and_its_scans_use_it() {
 	expect_status 404
 	req GET "/v1/scans/$taken"
 	expect_status 200
-	jq -e '(.geometry.matrices | length) == 24' "$body" >/dev/null || fail "matrices of a deleted calibration"
+	member '(.geometry.matrices | length) == 24' "$body" >/dev/null || fail "matrices of a deleted calibration"
 	stop_daemon
 }
 

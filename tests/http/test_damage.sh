@@ -241,7 +241,7 @@ test_a_file_that_is_cut_off_under_the_daemon() {
 		post_job "$small"
 		local end=$((SECONDS + 20)) missing='[[20, 23]]'
 		[[ $how != rm* ]] || missing='[[0, 23]]'
-		until req GET "/v1/scans/$scan" && jq -e ".missing == $missing" "$body" >/dev/null; do
+		until req GET "/v1/scans/$scan" && member ".missing == $missing" "$body" >/dev/null; do
 			[ $SECONDS -lt $end ] || fail "what the file no longer holds is missing: $(json .missing)"
 			sleep 0.05
 		done
@@ -397,7 +397,7 @@ large='{"scan": "SCAN", "grid": {"size": [96, 96, 96], "spacing_mm": [1, 1, 1]},
 made() { echo "$state/jobs/$job/final.nii"; }
 digested() { # its digest is there, so that nothing reads it any more
 	local end=$((SECONDS + 30))
-	until req GET "/v1/jobs/$job/volumes" && jq -e '.volumes | all(.digest != null)' "$body" >/dev/null; do
+	until req GET "/v1/jobs/$job/volumes" && member '.volumes | all(.digest != null)' "$body" >/dev/null; do
 		[ $SECONDS -lt $end ] || fail "a digest"
 	done
 }
@@ -478,9 +478,9 @@ test_a_damaged_checkpoint_begins_the_job_again() {
 	for again in flip truncate; do
 		post_job "{\"scan\": \"SCAN\", $grid, \"sart\": {\"iterations\": 150, \"subsets\": \"views\"}}"
 		yielded=$job
-		until req GET "/v1/jobs/$job" && jq -e '.iteration >= 2' "$body" >/dev/null; do sleep 0.02; done
+		until req GET "/v1/jobs/$job" && member '.iteration >= 2' "$body" >/dev/null; do sleep 0.02; done
 		post_job "{\"scan\": \"SCAN\", $grid, \"sart\": {\"iterations\": 100000, \"subsets\": \"views\"}, \"priority\": \"stat\"}"
-		until req GET "/v1/jobs/$job" && jq -e '.iteration >= 1' "$body" >/dev/null; do sleep 0.02; done
+		until req GET "/v1/jobs/$job" && member '.iteration >= 1' "$body" >/dev/null; do sleep 0.02; done
 		case $again in
 		flip) flip "$state/jobs/$yielded/checkpoint.f32" 3333 ;;
 		truncate) truncate -s -8 "$state/jobs/$yielded/checkpoint.f32" ;;

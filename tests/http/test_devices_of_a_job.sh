@@ -21,7 +21,7 @@ start_posted() {                                                                
 }
 digests() { # of all volumes of $job
 	local end=$((SECONDS + patience))
-	until req GET "/v1/jobs/$job/volumes" && jq -e 'all(.volumes[]; .digest)' "$body" >/dev/null; do
+	until req GET "/v1/jobs/$job/volumes" && member 'all(.volumes[]; .digest)' "$body" >/dev/null; do
 		[ $SECONDS -lt $end ] || fail "digests of $job"
 		sleep 0.05
 	done
@@ -29,7 +29,7 @@ digests() { # of all volumes of $job
 }
 devices_become() { # FILTER
 	local end=$((SECONDS + patience))
-	until req GET /v1/devices && jq -e "$1" "$body" >/dev/null; do
+	until req GET /v1/devices && member "$1" "$body" >/dev/null; do
 		[ $SECONDS -lt $end ] || fail "$1 of $(head -c 1500 "$body")"
 		sleep 0.05
 	done
@@ -37,7 +37,7 @@ devices_become() { # FILTER
 all_idle() { devices_become 'all(.devices[]; .state == "idle")'; }
 job_becomes() { # FILTER
 	local end=$((SECONDS + patience))
-	until req GET "/v1/jobs/$job" && jq -e "$1" "$body" >/dev/null; do
+	until req GET "/v1/jobs/$job" && member "$1" "$body" >/dev/null; do
 		[ $SECONDS -lt $end ] || fail "$1 of $(head -c 1500 "$body")"
 		sleep 0.02
 	done

@@ -110,7 +110,7 @@ test_peers_that_do_wrong() {
 			[ "$(grep -c ^0001 "$work/peer.log")" = 100 ] || fail "each object twice, got $(grep -c ^0001 "$work/peer.log")"
 			;;
 		unasked)
-			until req GET "/v1/jobs/$job/send" && jq -e '.sendings[0].error != null' "$body" >/dev/null; do sleep 0.05; done
+			until req GET "/v1/jobs/$job/send" && member '.sendings[0].error != null' "$body" >/dev/null; do sleep 0.05; done
 			expect_json '.sendings[0].error | contains("takes its word")'
 			jq '.destinations[0].unproven = true' "$work/destinations.json" >"$work/taken.json"
 			cp "$work/taken.json" "$work/destinations.json"
@@ -202,7 +202,7 @@ expect_told() { told | jq -e "$1" >/dev/null || fail "of the step, $1, got $(tol
 # step_becomes CONDITION: what the job says of its step
 step_becomes() {
 	local end=$((SECONDS + 30))
-	until req GET "/v1/jobs/$job/send" && jq -e "any(.sendings[]; .to == \"ris\" and $1)" "$body" >/dev/null; do
+	until req GET "/v1/jobs/$job/send" && member "any(.sendings[]; .to == \"ris\" and $1)" "$body" >/dev/null; do
 		[ $SECONDS -lt $end ] || fail "of the step of $job, $1: $(cat "$body")"
 		sleep 0.1
 	done
@@ -466,11 +466,11 @@ test_a_worklist_that_hangs_is_told_and_replaced() {
 	expect_json '.steps == [] and .checked == null and (.detail | contains("has not answered yet"))'
 	jq -n '{destinations: [], worklist: {host: "127.0.0.1", port: '"$dimse"', title: "ARCHIVE"}}' >"$work/destinations.json"
 	kill -HUP "$(cat "$work/daemon.pid")"
-	until req GET "/v1/worklist?wait=1" && jq -e '.detail == null and (.steps | map(.id)) == ["S2"]' "$body" >/dev/null; do sleep 0.2; done
+	until req GET "/v1/worklist?wait=1" && member '.detail == null and (.steps | map(.id)) == ["S2"]' "$body" >/dev/null; do sleep 0.2; done
 	# What another worklist told is not shown as this one's.
 	jq -n '{destinations: [], worklist: {host: "127.0.0.1", port: '"$peer_port"', title: "PEER"}}' >"$work/destinations.json"
 	kill -HUP "$(cat "$work/daemon.pid")"
-	until req GET "/v1/worklist?wait=0" && jq -e '.steps == []' "$body" >/dev/null; do sleep 0.05; done
+	until req GET "/v1/worklist?wait=0" && member '.steps == []' "$body" >/dev/null; do sleep 0.05; done
 }
 
 # What one row's archive does says nothing of another's of the same name.
@@ -483,7 +483,7 @@ test_a_changed_destination_is_another_archive() {
 	until grep -q ^0030 "$work/peer.log"; do sleep 0.05; done
 	jq -n '{destinations: [{name: "pacs", kind: "dimse", host: "127.0.0.1", port: '"$dimse"', title: "ARCHIVE"}]}' >"$work/destinations.json"
 	kill -HUP "$(cat "$work/daemon.pid")"
-	until req GET /v1/destinations && jq -e '.destinations[0] | .reachable and .detail == null' "$body" >/dev/null; do sleep 0.05; done
+	until req GET /v1/destinations && member '.destinations[0] | .reachable and .detail == null' "$body" >/dev/null; do sleep 0.05; done
 	! grep -q "answers again" "$work/cbctd.err" || fail "it never was away"
 }
 

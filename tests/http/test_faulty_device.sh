@@ -24,7 +24,7 @@ digest() { # of the final volume of $job
 }
 devices_become() { # FILTER
 	local end=$((SECONDS + 60))
-	until req GET /v1/devices && jq -e "$1" "$body" >/dev/null; do
+	until req GET /v1/devices && member "$1" "$body" >/dev/null; do
 		[ $SECONDS -lt $end ] || fail "$1 of $(head -c 1500 "$body")"
 		sleep 0.05
 	done

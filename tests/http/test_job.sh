@@ -123,7 +123,7 @@ test_conjugate_gradients_in_place_of_sart() {
 	undisturbed=$(json '.volumes[0].digest')
 	post_job "$recipe"
 	preempted=$job
-	until req GET "/v1/jobs/$job" && jq -e '.iteration >= 3' "$body" >/dev/null; do sleep 0.02; done
+	until req GET "/v1/jobs/$job" && member '.iteration >= 3' "$body" >/dev/null; do sleep 0.02; done
 	post_job "$small"'"fdk": {}, "priority": "stat"}'
 	wait_job succeeded
 	job=$preempted

@@ -64,11 +64,11 @@ test_an_arm_that_wanders_is_followed_and_gone_on_with() {
 	# A job that yields amid its refinement and behind it goes on, and ends with the same bits.
 	post_job "$recipe$iterations"
 	yielded=$job
-	until req GET "/v1/jobs/$job" && jq -e '.state == "running"' "$body" >/dev/null; do sleep 0.02; done
+	until req GET "/v1/jobs/$job" && member '.state == "running"' "$body" >/dev/null; do sleep 0.02; done
 	post_job "$recipe"'"fdk": {}, "priority": "stat"}'
 	wait_job succeeded
 	job=$yielded
-	until req GET "/v1/jobs/$job" && jq -e '.iteration >= 2' "$body" >/dev/null; do sleep 0.02; done
+	until req GET "/v1/jobs/$job" && member '.iteration >= 2' "$body" >/dev/null; do sleep 0.02; done
 	post_job "$recipe"'"fdk": {}, "priority": "stat"}'
 	wait_job succeeded
 	job=$yielded
@@ -193,12 +193,12 @@ test_few_noisy_views_are_refined_with_the_volume_of_another_job() {
 		\"refine\": {\"geometry\": true, \"reference\": {\"job\": \"$good\"}}}"
 	expect_status 202
 	waiting=$(jq -r .id "$body")
-	until req GET "/v1/jobs/$waiting" && jq -e '.iteration >= 2' "$body" >/dev/null; do sleep 0.02; done
+	until req GET "/v1/jobs/$waiting" && member '.iteration >= 2' "$body" >/dev/null; do sleep 0.02; done
 	req GET "/v1/jobs/$waiting/refinement"
 	found=$(jq -cS . "$body")
 	mv "$reference" "$work/"
 	kill -9 "$(worker_of)"
-	until req GET "/v1/jobs/$waiting" && jq -e '.attempts == 2 and .iteration >= 2' "$body" >/dev/null; do
+	until req GET "/v1/jobs/$waiting" && member '.attempts == 2 and .iteration >= 2' "$body" >/dev/null; do
 		[ "$(json .state)" != failed ] || fail "a job that had refined its geometry: $(json .error)"
 		sleep 0.02
 	done
@@ -216,7 +216,7 @@ test_few_noisy_views_are_refined_with_the_volume_of_another_job() {
 		\"refine\": {\"geometry\": true, \"reference\": {\"job\": \"$good\"}}}"
 	expect_status 202
 	other=$(jq -r .id "$body")
-	until req GET "/v1/jobs/$other" && jq -e '.iteration >= 2' "$body" >/dev/null; do sleep 0.02; done
+	until req GET "/v1/jobs/$other" && member '.iteration >= 2' "$body" >/dev/null; do sleep 0.02; done
 	cp "$state/jobs/$waiting/refinement.json" "$state/jobs/$other/"
 	mv "$reference" "$work/"
 	kill -9 "$(worker_of)"

@@ -52,7 +52,7 @@ put_one() { # K: a projection
 }
 waits_for_scatter() {
 	local end=$((SECONDS + 60))
-	until req GET "/v1/jobs/$job" && jq -e '.state == "waiting" and (.waiting_for | index("scatter") != null)' "$body" >/dev/null; do
+	until req GET "/v1/jobs/$job" && member '.state == "waiting" and (.waiting_for | index("scatter") != null)' "$body" >/dev/null; do
 		[ $SECONDS -lt $end ] || fail "a job that waits for scatter: $(json '{state, waiting_for}')"
 		sleep 0.05
 	done
@@ -182,7 +182,7 @@ test_an_image_is_removed_and_another_put() {
 	# not while a job needs them
 	scan=$uploaded
 	post_job '{"scan": "SCAN", "grid": {"size": [40, 40, 28], "spacing_mm": [2.6, 2.6, 2.6]}, "sart": {"iterations": 100000}, "tv": null}'
-	until req GET "/v1/jobs/$job" && jq -e '.iteration >= 1' "$body" >/dev/null; do sleep 0.05; done
+	until req GET "/v1/jobs/$job" && member '.iteration >= 1' "$body" >/dev/null; do sleep 0.05; done
 	for k in scatter/10 scatter; do
 		req DELETE "/v1/scans/$scan/$k"
 		expect_problem 409
@@ -316,7 +316,7 @@ test_damage_under_the_running_daemon_is_told_and_healed() {
 			req GET "/v1/scans/$scan/scatter/44"
 			expect_problem 500
 		fi
-		for k in 44 0 10 20 30 40; do put_image $k && jq -e '.stored + .same == 1' "$body" >/dev/null || fail "$how: an image that is sent again"; done
+		for k in 44 0 10 20 30 40; do put_image $k && member '.stored + .same == 1' "$body" >/dev/null || fail "$how: an image that is sent again"; done
 		post_job "$recipe"
 		wait_job succeeded
 		[ "$(digest)" = "$first" ] || fail "the same bits ($how)"
@@ -410,18 +410,18 @@ test_a_job_that_goes_on_later_never_mixes_two_sets_of_images() {
 		expect_problem 500
 	}
 	has_yielded() {
-		req GET "/v1/jobs/$job" && jq -e '.state == "queued" and .iteration >= 1' "$body" >/dev/null
+		req GET "/v1/jobs/$job" && member '.state == "queued" and .iteration >= 1' "$body" >/dev/null
 	}
 	begin_and_yield() { # a job of new images, which had begun when $stat came; that one runs until it is cancelled
 		local mine images
 		for _ in $(seq 20); do # it may be faster than this
 			scan=$(cbct upload --quiet --url "$url" "$work/images") || fail "cbct upload"
 			post_job "$going"
-			until req GET "/v1/jobs/$job" && jq -e '.iteration >= 2' "$body" >/dev/null; do sleep 0.02; done
+			until req GET "/v1/jobs/$job" && member '.iteration >= 2' "$body" >/dev/null; do sleep 0.02; done
 			mine=$job images=$scan scan=$good
 			post_job "{\"scan\": \"SCAN\", $iterate, \"sart\": {\"iterations\": 100000}, \"priority\": \"stat\"}"
 			stat=$job job=$mine scan=$images
-			until req GET "/v1/jobs/$stat" && jq -e '.state == "running"' "$body" >/dev/null; do sleep 0.02; done
+			until req GET "/v1/jobs/$stat" && member '.state == "running"' "$body" >/dev/null; do sleep 0.02; done
 			has_yielded && return
 			req DELETE "/v1/jobs/$stat"
 		done
@@ -490,11 +490,11 @@ test_a_job_that_goes_on_later_never_mixes_two_sets_of_images() {
 	# so does one that runs
 	scan=$(cbct upload --quiet --url "$url" "$work/images") || fail "cbct upload"
 	post_job "{\"scan\": \"SCAN\", $iterate, \"sart\": {\"iterations\": 100000}}"
-	until req GET "/v1/jobs/$job" && jq -e '.iteration >= 2' "$body" >/dev/null; do sleep 0.02; done
+	until req GET "/v1/jobs/$job" && member '.iteration >= 2' "$body" >/dev/null; do sleep 0.02; done
 	lose_with_its_record
 	put_other
 	expect_status 201
-	until req GET "/v1/jobs/$job" && jq -e '.attempts >= 2' "$body" >/dev/null; do
+	until req GET "/v1/jobs/$job" && member '.attempts >= 2' "$body" >/dev/null; do
 		expect_json '.state == "running" or .state == "queued"'
 		sleep 0.05
 	done

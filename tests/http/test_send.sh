@@ -58,7 +58,7 @@ test_an_archive_that_is_away_and_comes_back() {
 	expect_problem 422 /volumes
 	send '{"to": "nowhere"}'
 	expect_status 202
-	until req GET "/v1/jobs/$job/send" && jq -e 'all(.sendings[]; .attempts >= 2)' "$body" >/dev/null; do sleep 0.05; done
+	until req GET "/v1/jobs/$job/send" && member 'all(.sendings[]; .attempts >= 2)' "$body" >/dev/null; do sleep 0.05; done
 	expect_json '.sendings | length == 2 and all(.state == "queued" or .state == "sending")'
 	sending_becomes queued
 	expect_json 'all(.sendings[]; (.error | contains("cannot be reached")) and .next != null and .stored == 0)'
@@ -74,14 +74,14 @@ test_an_archive_that_is_away_and_comes_back() {
 	expect_json '[.sendings[] | [.to, .state]] | sort == [["nowhere", "stopped"], ["pacs", "queued"]] or . == [["nowhere", "stopped"], ["pacs", "sending"]]'
 	grep -Eq '^cbctd_oldest_unsent_seconds [0-9.]*[1-9]' <(curl -s "$url/metrics") || fail "the age of what is unsent"
 	start_archive
-	until req GET "/v1/jobs/$job/send" && jq -e 'any(.sendings[]; .to == "pacs" and .state == "sent" and .stored == 50)' "$body" >/dev/null; do sleep 0.2; done
+	until req GET "/v1/jobs/$job/send" && member 'any(.sendings[]; .to == "pacs" and .state == "sent" and .stored == 50)' "$body" >/dev/null; do sleep 0.2; done
 	[ "$(curl -sSf "$rest/instances" | jq length)" = 50 ] || fail "50 objects"
 	# What was stopped begins anew when it is asked for, and ends with its job.
 	send '{"to": "nowhere"}'
 	expect_status 202
 	req DELETE "/v1/jobs/$job"
 	expect_status 204
-	until req GET "/v1/destinations" && jq -e 'all(.destinations[]; .unsent == 0)' "$body" >/dev/null; do sleep 0.1; done
+	until req GET "/v1/destinations" && member 'all(.destinations[]; .unsent == 0)' "$body" >/dev/null; do sleep 0.1; done
 }
 
 test_archives_that_lie_forget_and_refuse() {
@@ -129,7 +129,7 @@ test_a_token_comes_from_a_file_and_is_told_to_nobody() {
 	sending_becomes failed
 	expect_json '.sendings[0].error | contains("kept no such volume")'
 	send '{"to": "pacs"}'
-	until req GET "/v1/jobs/$job/send" && jq -e 'any(.sendings[]; .error != null and (.error | contains("401")))' "$body" >/dev/null; do sleep 0.05; done
+	until req GET "/v1/jobs/$job/send" && member 'any(.sendings[]; .error != null and (.error | contains("401")))' "$body" >/dev/null; do sleep 0.05; done
 	echo secret-token >"$work/token"
 	sending_becomes sent 30 final
 	expect_json '.sendings[] | select(.volume == "final") | .instances == 1'
@@ -171,7 +171,7 @@ test_what_cannot_be_sent_is_refused_or_told() {
 	# A rule for jobs that nobody has told how their patient lies: the job is made, the sending fails and says why.
 	destinations '{"name": "pacs", "kind": "dicomweb", "url": "http://127.0.0.1:'$("$python" "$top/tests/http/send.py" ports 1)'", "send": "last"}'
 	kill -HUP "$(cat "$work/daemon.pid")"
-	until req GET /v1/destinations && jq -e '.destinations[0].send == "last"' "$body" >/dev/null; do sleep 0.05; done
+	until req GET /v1/destinations && member '.destinations[0].send == "last"' "$body" >/dev/null; do sleep 0.05; done
 	job_of null
 	sending_becomes failed
 	expect_json '.sendings[0].error | contains("how the patient lies")'
