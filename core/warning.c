@@ -158,6 +158,15 @@ const struct warning_kind warning_kinds[] = {
      "would show more."},
     {"rays_left_out", SEVERITY_INFO,
      "There is something very dense in the image, metal or as dense as that: expect streaks around it."},
+    {"very_dense", SEVERITY_CAUTION,
+     "There is a lot that is very dense in the image, such as metal or very dense bone: expect streaks, and do not "
+     "rely "
+     "on gray values in it and beside it."},
+    {"iterations_held_back", SEVERITY_CAUTION,
+     "Iterations put streaks into the image, as beside something dense that may lie outside of it: the result stays "
+     "nearer to the plain reconstruction, which has streaks, too."},
+    {"noise_beside_metal", SEVERITY_CAUTION,
+     "The image is very noisy, as beside a lot of metal: fine detail is smoothed away, and gray values are estimates."},
     {"iterations_settled", SEVERITY_INFO,
      "The projections show more than the image can hold, finer detail or a part of the patient beyond the detector, so "
      "that later iterations change it less."},

@@ -58,6 +58,8 @@ struct correction_job {
 	bool averages;                     /* recipe_averages: iterations get means over pixels (averaging.h) */
 	bool subsets;                      /* iterations are SART's */
 	struct recon_agreement *agreement; /* what the check of the geometry finds goes there */
+	bool *outside;                     /* set where matter outside of the grid was taken out of the projections */
+	bool *left_out_dense;              /* set where rays through what is very dense were left out of them */
 	double *settled;                   /* iterations after which relaxation falls (averaging.h); INFINITY: never */
 	const struct warning_sink *warnings;
 	const struct cancel *cancel;

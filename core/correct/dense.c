@@ -103,8 +103,13 @@ static int has_any(const struct correction_job *job, double least, bool *ret_any
 	return code;
 }
 
-/* True where dense voxels are few beside those of the object; ret_mean: of theirs, 1/mm. */
-static int are_few(const struct correction_job *job, double least, bool *ret_few, double *ret_mean, struct error *err)
+/* Dense voxels: how many, those of the object, and the mean of their values, 1/mm. */
+struct dense_count {
+	size_t dense, object;
+	double mean;
+};
+
+static int count_dense(const struct correction_job *job, double least, struct dense_count *ret_count, struct error *err)
 {
 	const struct grid *grid = &job->recipe->grid;
 	const size_t slice = (size_t)grid->size[0] * (size_t)grid->size[1];
@@ -127,12 +132,12 @@ static int are_few(const struct correction_job *job, double least, bool *ret_few
 	free(values);
 	if (code != 0)
 		return code;
-	*ret_few = (double)found <= FEW * (double)object;
-	*ret_mean = found > 0 ? sum / (double)found : 0;
+	*ret_count = (struct dense_count){found, object, found > 0 ? sum / (double)found : 0};
 	return 0;
 }
 
-static int find(const struct correction_job *job, struct metal *dense, double *ret_mean, struct error *err)
+/* The list is empty where nothing is dense, and where too much of the object is. */
+static int find(const struct correction_job *job, struct metal *dense, struct dense_count *ret_count, struct error *err)
 {
 	const struct metal_tools tools = metal_tools_of(job);
 	const double least = DENSE * job->recipe->mu_water;
@@ -140,8 +145,10 @@ static int find(const struct correction_job *job, struct metal *dense, double *r
 	int code = has_any(job, least, &does, err);
 
 	if (code == 0 && does)
-		code = are_few(job, least, &does, ret_mean, err);
-	return code == 0 && does ? metal_find(dense, &tools, job->volume, least, err) : code;
+		code = count_dense(job, least, ret_count, err);
+	if (code < 0 || !does || (double)ret_count->dense > FEW * (double)ret_count->object)
+		return code;
+	return metal_find(dense, &tools, job->volume, least, err);
 }
 
 /* Of all rays, those that pass what is dense. */
@@ -159,6 +166,7 @@ static int leave_out(const struct correction_job *job, struct metal *dense, stru
 	if (dense->traces_count == 0)
 		return 0;
 	tools.slots = slots_of(job->geometry);
+	*job->left_out_dense = true;
 	if (*job->iteration == 0)
 		warning_tell(job->warnings, "rays_left_out",
 			     "%zu voxels have at least %g HU or belong to such: iterations leave out the %.3g %% of "
@@ -167,12 +175,22 @@ static int leave_out(const struct correction_job *job, struct metal *dense, stru
 	return metal_leave_out(dense, &tools, err);
 }
 
+static void tell_kept(const struct correction_job *job, const struct dense_count *count)
+{
+	warning_tell(
+	    job->warnings, "very_dense",
+	    "%zu voxels have at least %g HU, %.3g %% of those of the object, and %.0f HU in the mean: too many, "
+	    "or too many rays pass them, to leave those rays out of the iterations",
+	    count->dense, 1000 * (DENSE - 1), 100 * (double)count->dense / (double)count->object,
+	    1000 * (count->mean / job->recipe->mu_water - 1));
+}
+
 /* Least squares ask for all rays; only SART's steps keep what no ray passes. */
 static int apply(const struct correction_job *job, void *state, enum correction_time time, bool *ret_changed,
 		 struct error *err)
 {
 	const bool first = *job->iteration == 0;
-	double mean = 0;
+	struct dense_count count = {0};
 	int code = 0;
 
 	(void)time;
@@ -180,12 +198,14 @@ static int apply(const struct correction_job *job, void *state, enum correction_
 	if (!job->subsets)
 		return 0;
 	if (first)
-		code = find(job, state, &mean, err);
+		code = find(job, state, &count, err);
 	if (code == 0)
 		code = find_traces(job, state, err);
 	/* A run that goes on has the list of what was left out, or none. */
-	if (code == 0 && first && share_of(job, state) > RAYS_MOST && mean < SURELY * job->recipe->mu_water)
+	if (code == 0 && first && share_of(job, state) > RAYS_MOST && count.mean < SURELY * job->recipe->mu_water)
 		metal_clear(state);
+	if (code == 0 && count.dense > 0 && ((const struct metal *)state)->traces_count == 0)
+		tell_kept(job, &count);
 	return code == 0 ? leave_out(job, state, err) : code;
 }
 

@@ -177,6 +177,8 @@ static int apply(const struct correction_job *job, void *state, enum correction_
 		warn_of_zero(job);
 	if (code == 0 && options.truncated)
 		*job->settled = fmin(*job->settled, EXTERIOR_SETTLED);
+	if (rows.outside + rows.truncated > 0)
+		*job->outside = true;
 	if (code == 0)
 		warn_of_outside(job, rows.outside);
 	exterior_volume_clear(&exterior);

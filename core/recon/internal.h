@@ -9,6 +9,7 @@
 #include "core/recon/ends.h"
 #include "core/recon/held_out.h"
 #include "core/recon/refining.h"
+#include "core/recon/restraint.h"
 #include "core/recon/rim.h"
 #include "core/recon/stopping.h"
 #include "core/recon/support.h"
@@ -46,6 +47,9 @@ struct recon {
 	struct ends *ends;               /* the end slices of volumes that are kept; NULL: they are the iterate's */
 	struct alternation *alternation; /* from slice to slice, not in volumes that are kept; NULL: views see it */
 	struct rim *rim;                 /* of the field of view, in volumes that are kept; NULL: it is the iterate's */
+	struct restraint *restraint;     /* of volumes that are kept, beside their start; NULL: there is none */
+	bool left_out_dense;             /* rays through what is very dense have no part in the iterations */
+	bool outside;                    /* matter outside of the grid was taken out of the projections */
 	struct support *support;         /* NULL until a volume is kept */
 	struct refining *refining;       /* NULL where the geometry is not refined */
 	struct held_out *held_out;       /* NULL where no view is held out */
@@ -125,6 +129,12 @@ void recon_tell_progress(struct recon *recon, enum stage stage, int iteration);
 bool keeps_projections(const struct recipe *recipe);
 /* True if the recipe's algorithm is the backend's own update over ordered subsets. */
 bool has_subsets(const struct recipe *recipe);
+/* Iterations that nobody has set: they begin with FDK, and TV finds its strength. */
+static inline bool recipe_has_restraint(const struct recipe *recipe)
+{
+	return recipe_has_rim(recipe) && has_subsets(recipe) && recipe->tv.on && recipe->tv.automatic &&
+	       !recipe->metal.on;
+}
 
 /* The options point into recon, which is described, has its input, and its weights where FDK is on. */
 struct plan_options plan_options(const struct recon *recon);

@@ -181,6 +181,8 @@ static size_t kept_bytes(const struct recon *recon)
 		bytes += ends_bytes(&recipe->grid, recon->geometry, &recon->orbit);
 	if (recipe_has_rim(recipe))
 		bytes += rim_bytes(&recipe->grid, &recon->orbit);
+	if (recipe_has_restraint(recipe))
+		bytes += restraint_bytes(&recipe->grid);
 	if (recipe->algorithm != NULL)
 		bytes += alternation_bytes(&recipe->grid);
 	if (thin_width(recipe, &recon->orbit) > 0)

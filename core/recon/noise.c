@@ -39,6 +39,8 @@ static const double INSIDE = 0.8;
 
 /* Bone and metal count as so many times the object's mean at most: a screw says nothing of the anatomy's contrast. */
 static const double BRIGHT = 2.5;
+/* Times water's attenuation, which bone does not reach. */
+static const double METAL = 3.1;
 
 /* Voxels above `level` are the object. */
 struct classes {
@@ -46,10 +48,28 @@ struct classes {
 };
 
 /*
+ * The value from which on voxels are metal and no part of the object, INFINITY where there is none. Beside a cup of
+ * steel, body and air would be one class, and the cup's edges the noise. An object that is metal itself has more of
+ * that than of anything between half of water and metal.
+ */
+static float metal_of(const float *slices, size_t voxels, double mu_water)
+{
+	const size_t stride = voxels / SAMPLES + 1;
+	const float metal = (float)(METAL * mu_water), body = (float)(mu_water / 2);
+	size_t dense = 0, object = 0;
+
+	for (size_t i = 0; i < voxels; i += stride) {
+		dense += slices[i] >= metal;
+		object += slices[i] >= body && slices[i] < metal;
+	}
+	return dense > 0 && dense < object ? metal : INFINITY;
+}
+
+/*
  * The level between background and object: the mean of both classes' means
  * (Ridler and Calvard, IEEE Trans. Syst. Man Cybern. 8, 1978).
  */
-static struct classes classes_of(const float *slices, size_t voxels)
+static struct classes classes_of(const float *slices, size_t voxels, float metal)
 {
 	const size_t stride = voxels / SAMPLES + 1;
 	struct classes classes = {0};
@@ -62,7 +82,7 @@ static struct classes classes_of(const float *slices, size_t voxels)
 		for (size_t i = 0; i < voxels; i += stride) {
 			const double v = (double)slices[i];
 
-			if (!isfinite(v))
+			if (!isfinite(v) || slices[i] >= metal)
 				continue;
 			sum[v > last] += v;
 			count[v > last]++;
@@ -138,7 +158,7 @@ static int compare_floats(const void *a, const void *b)
 }
 
 /* The median of the object. ERR_NO_MEMORY. */
-static int find_median(const float *slices, size_t voxels, struct classes *classes, struct error *err)
+static int find_median(const float *slices, size_t voxels, float metal, struct classes *classes, struct error *err)
 {
 	const size_t stride = voxels / SAMPLES + 1;
 	float *values = malloc(sizeof(*values) * (voxels / stride + 1));
@@ -147,7 +167,7 @@ static int find_median(const float *slices, size_t voxels, struct classes *class
 	if (values == NULL)
 		return error_set(err, ERR_NO_MEMORY, "no memory for the median of %zu voxels", voxels);
 	for (size_t i = 0; i < voxels; i += stride)
-		if ((double)slices[i] > classes->level && isfinite(slices[i]))
+		if ((double)slices[i] > classes->level && isfinite(slices[i]) && slices[i] < metal)
 			values[count++] = slices[i];
 	qsort(values, count, sizeof(*values), compare_floats);
 	classes->median = count > 0 ? (double)values[count / 2] : 0;
@@ -215,13 +235,15 @@ static int quartile_of_cubes(const float *slices, const int size[3], int side, d
 	return 0;
 }
 
-int noise_of_slices(const float *slices, const int size[3], struct volume_noise *ret_noise, struct error *err)
+int noise_of_slices(const float *slices, const int size[3], double mu_water, struct volume_noise *ret_noise,
+		    struct error *err)
 {
 	const size_t voxels = (size_t)size[0] * (size_t)size[1] * (size_t)size[2];
-	struct classes classes = classes_of(slices, voxels);
+	const float metal = metal_of(slices, voxels, mu_water);
+	struct classes classes = classes_of(slices, voxels, metal);
 	double variance = 0;
 	size_t count = 0;
-	int code = classes.mean > 0 ? find_median(slices, voxels, &classes, err) : 0;
+	int code = classes.mean > 0 ? find_median(slices, voxels, metal, &classes, err) : 0;
 
 	if (classes.mean > 0)
 		for (int i = 0; i < SIDES && code == 0 && count < CUBES_LEAST; i++)
@@ -307,7 +329,7 @@ double noise_reach(const struct tv_options *options)
 	return options->unit * (options->method == TV_GRADIENT ? fmin(steps, balanced) : balanced);
 }
 
-int noise_measure(const struct backend *backend, struct volume *volume, const struct grid *grid,
+int noise_measure(const struct backend *backend, struct volume *volume, const struct grid *grid, double mu_water,
 		  struct volume_noise *ret_noise, struct error *err)
 {
 	const int count = grid->size[2] < NOISE_SLICES ? grid->size[2] : NOISE_SLICES;
@@ -319,7 +341,7 @@ int noise_measure(const struct backend *backend, struct volume *volume, const st
 		return error_set(err, ERR_NO_MEMORY, "no memory for %d slices", count);
 	code = backend->volume_download(volume, (grid->size[2] - count) / 2, count, slices, err);
 	if (code == 0)
-		code = noise_of_slices(slices, size, ret_noise, err);
+		code = noise_of_slices(slices, size, mu_water, ret_noise, err);
 	free(slices);
 	return code;
 }

@@ -14,13 +14,15 @@ enum { NOISE_SLICES = 24 };
 
 /*
  * Measures the noise of a volume's middle slices. All is 0 where nothing stands out of the background.
- * The same voxels give the same bits, for any number of threads.
+ * mu_water in 1/mm: what is metal beside it
+ * is left out. The same voxels give the same bits, for any number of threads.
  */
-int noise_measure(const struct backend *backend, struct volume *volume, const struct grid *grid,
+int noise_measure(const struct backend *backend, struct volume *volume, const struct grid *grid, double mu_water,
 		  struct volume_noise *ret_noise, struct error *err);
 
 /* Measures the noise of slices [z][y][x] in the host's memory. */
-int noise_of_slices(const float *slices, const int size[3], struct volume_noise *ret_noise, struct error *err);
+int noise_of_slices(const float *slices, const int size[3], double mu_water, struct volume_noise *ret_noise,
+		    struct error *err);
 
 enum noise_stage { NOISE_OF_FDK, NOISE_OF_SART };
 /*

@@ -119,6 +119,8 @@ static int open_corrections(struct recon *recon, struct error *err)
 	    .averages = recipe_averages(&recon->recipe, &recon->orbit),
 	    .subsets = has_subsets(&recon->recipe),
 	    .agreement = &recon->agreement,
+	    .outside = &recon->outside,
+	    .left_out_dense = &recon->left_out_dense,
 	    .settled = &recon->settled,
 	    .warnings = &recon->warnings,
 	    .cancel = &recon->cancel,
@@ -219,6 +221,9 @@ int recon_open(const struct backend *backend, struct device *device, const struc
 		code = open_ends(recon, err);
 	if (code == 0)
 		code = open_rim(recon, err);
+	if (code == 0 && recipe_has_restraint(&recon->recipe))
+		code = restraint_new(&recon->recipe.grid, recon->recipe.mu_water, recon->recipe.iterate.nonnegative,
+				     &recon->restraint, err);
 	if (code == 0 && recon->recipe.algorithm != NULL)
 		code = alternation_new(&recon->recipe.grid, recon->geometry, recon->recipe.mu_water,
 				       &recon->alternation, err);
@@ -239,6 +244,7 @@ void recon_clear(struct recon *recon)
 	held_out_free(recon->held_out);
 	ends_free(recon->ends);
 	rim_free(recon->rim);
+	restraint_free(recon->restraint);
 	alternation_free(recon->alternation);
 	corrections_close(&recon->corrections);
 	recon_release(recon);
@@ -437,10 +443,10 @@ static size_t stopping_bytes(const struct recon *recon)
 size_t recon_state_bytes(const struct recon *recon)
 {
 	return algorithm_bytes(recon) + ends_state_bytes(recon->ends) + rim_state_bytes(recon->rim) +
-	       stopping_bytes(recon);
+	       restraint_state_bytes(recon->restraint) + stopping_bytes(recon);
 }
 
-/* Writes the algorithm's state, and behind it the end slices and the rim that the iterations began with. */
+/* Writes the algorithm's state, and behind it the end slices, the rim and the volume that the iterations began with. */
 int recon_save_state(struct recon *recon, const struct checkpoint_sink *sink, struct error *err)
 {
 	int code = 0;
@@ -453,29 +459,47 @@ int recon_save_state(struct recon *recon, const struct checkpoint_sink *sink, st
 		code = sink->write(sink->context, &recon->stopping, sizeof(recon->stopping), err);
 	if (code == 0 && rim_state_bytes(recon->rim) > 0)
 		code = sink->write(sink->context, rim_state(recon->rim), rim_state_bytes(recon->rim), err);
+	if (code == 0 && restraint_state_bytes(recon->restraint) > 0)
+		code = sink->write(sink->context, restraint_state(recon->restraint),
+				   restraint_state_bytes(recon->restraint), err);
 	return code;
 }
 
-/* Of a run that has no rim, or not yet. */
-static size_t state_without_rim(const struct recon *recon)
+/* Of a run that has neither a rim nor a restraint, or not yet. */
+static size_t state_without_start(const struct recon *recon)
 {
-	return recon_state_bytes(recon) - rim_state_bytes(recon->rim);
+	return recon_state_bytes(recon) - rim_state_bytes(recon->rim) - restraint_state_bytes(recon->restraint);
+}
+
+/* How much of a state of this size is the rim's; *ret_fits: any run of the recipe may have had so many bytes. */
+static size_t rim_part(const struct recon *recon, size_t size, bool *ret_fits)
+{
+	const struct grid *grid = &recon->recipe.grid;
+	const size_t whole = state_without_start(recon);
+	const size_t rim = recon->rim != NULL ? rim_bytes(grid, &recon->orbit) : 0;
+	const size_t start = recon->restraint != NULL ? restraint_kept_bytes(grid) : 0;
+	const bool has_rim = size == whole + rim || size == whole + rim + start;
+
+	*ret_fits = has_rim || size == whole || size == whole + start;
+	return has_rim ? rim : 0;
 }
 
 bool recon_state_fits(const struct recon *recon, size_t size)
 {
-	const size_t whole = state_without_rim(recon);
-	const size_t rim = recon->rim != NULL ? rim_bytes(&recon->recipe.grid, &recon->orbit) : 0;
+	bool fits;
 
-	return size == whole || size == whole + rim;
+	rim_part(recon, size, &fits);
+	return fits;
 }
 
 int recon_resume_state(struct recon *recon, const char *bytes, size_t size, struct error *err)
 {
-	const size_t own = algorithm_bytes(recon), whole = state_without_rim(recon);
+	const size_t own = algorithm_bytes(recon), whole = state_without_start(recon);
+	bool fits;
+	const size_t rim = rim_part(recon, size, &fits);
 	int code = 0;
 
-	if (!recon->resumed || !recon_state_fits(recon, size))
+	if (!recon->resumed || !fits)
 		return error_set(err, ERR_INVALID, "%zu bytes of an algorithm that holds %zu", size,
 				 recon_state_bytes(recon));
 	if (own > 0) {
@@ -487,8 +511,10 @@ int recon_resume_state(struct recon *recon, const char *bytes, size_t size, stru
 		ends_resume(recon->ends, bytes + own);
 	if (code == 0 && stopping_bytes(recon) > 0)
 		memcpy(&recon->stopping, bytes + own + ends_state_bytes(recon->ends), sizeof(recon->stopping));
-	if (code == 0 && size > whole) /* the rim stands behind the rest */
+	if (code == 0 && rim > 0) /* rim and restraint stand behind the rest */
 		code = rim_resume(recon->rim, bytes + whole, err);
+	if (code == 0 && size > whole + rim)
+		code = restraint_resume(recon->restraint, bytes + whole + rim, err);
 	return code;
 }
 

@@ -129,6 +129,27 @@ static int show_rim(struct recon *recon, struct volume_norms *norms, struct erro
 	return code == 0 && changed ? measure(recon, NULL, norms, err) : code;
 }
 
+/* An iterate as near to its start as it has to be; `before`, which no iteration reads, has the iterate. */
+static int show_restrained(struct recon *recon, struct volume_norms *norms, struct error *err)
+{
+	struct restraint_report report = {0};
+	int code = 0;
+
+	if (restraint_state_bytes(recon->restraint) == 0 || recon->iteration == 0)
+		return 0;
+	if (recon->alternation == NULL && !recon->smoothed)
+		code = recon->backend->volume_copy(recon->before, recon->volume, err);
+	if (code == 0)
+		code = restraint_show(recon->restraint, recon->backend, recon->volume, recon->left_out_dense, &report,
+				      err);
+	recon->smoothed = recon->smoothed || report.changed;
+	if (code == 0 && report.changed)
+		code = measure(recon, NULL, norms, err);
+	if (code == 0 && recon->ended)
+		warn_restraint(&recon->warnings, &recon->recipe, &report);
+	return code;
+}
+
 /* The end slices of an iterate as they are kept; the last one's are told of where they are uncertain. */
 static int show_ends(struct recon *recon, struct volume_norms *norms, struct error *err)
 {
@@ -191,6 +212,8 @@ static int keep(struct recon *recon, const char *name, const char *stage, struct
 	if (code == 0)
 		code = show_thick(recon, &kept.norms, err);
 	if (code == 0)
+		code = show_restrained(recon, &kept.norms, err);
+	if (code == 0)
 		code = show_rim(recon, &kept.norms, err);
 	if (code == 0)
 		code = show_ends(recon, &kept.norms, err);
@@ -210,7 +233,8 @@ static int keep(struct recon *recon, const char *name, const char *stage, struct
 /* The noise that TV is to take out: that of the FDK volume, or without FDK of the first iterate. */
 static int measure_noise(struct recon *recon, struct error *err)
 {
-	int code = noise_measure(recon->backend, recon->volume, &recon->recipe.grid, &recon->noise, err);
+	int code = noise_measure(recon->backend, recon->volume, &recon->recipe.grid, recon->recipe.mu_water,
+				 &recon->noise, err);
 
 	if (code < 0)
 		return code;
@@ -401,6 +425,19 @@ static int leave_out(struct recon *recon, struct error *err)
 	return code == 0 ? hold_out(recon, err) : code;
 }
 
+/* TV of the FDK volume; of its means beside what is very dense, what TV takes is noted. */
+static int smooth_fdk(struct recon *recon, struct error *err)
+{
+	const bool notes = recon->restraint != NULL && recon->norms.maximum >= RESTRAINT_METAL * recon->recipe.mu_water;
+	int code = notes ? recon->backend->volume_copy(recon->before, recon->volume, err) : 0;
+
+	if (code == 0)
+		code = run_tv(recon, 0, err);
+	return code == 0 && notes
+		   ? restraint_see_loss(recon->restraint, recon->backend, recon->before, recon->volume, err)
+		   : code;
+}
+
 /* The FDK volume and what is made of it before the first iteration. */
 static int finish_fdk(struct recon *recon, struct error *err)
 {
@@ -424,7 +461,7 @@ static int finish_fdk(struct recon *recon, struct error *err)
 		return code;
 	code = cancel_check(&recon->cancel, err);
 	if (code == 0)
-		code = run_tv(recon, 0, err);
+		code = smooth_fdk(recon, err);
 	if (code == 0)
 		code = measure(recon, NULL, &recon->norms, err);
 	if (code == 0 && recon->norms.not_finite > 0)
@@ -551,6 +588,16 @@ static int tell_residual(const struct recon *recon, const struct history_row *ro
 	return code;
 }
 
+/* Takes what iterations are held against, of those that may come out worse than they begin. */
+static int begin_restraint(struct recon *recon, struct error *err)
+{
+	const bool dense = recon->norms.maximum >= RESTRAINT_DENSE * recon->recipe.mu_water;
+
+	if (recon->restraint == NULL || recon->iteration > 0 || !(dense || recon->outside))
+		return 0;
+	return restraint_begin(recon->restraint, recon->backend, recon->volume, err);
+}
+
 static int run_iterations(struct recon *recon, struct error *err)
 {
 	const struct recon_hooks *hooks = recon->hooks;
@@ -559,6 +606,8 @@ static int run_iterations(struct recon *recon, struct error *err)
 
 	if (failed == 0 && !last && recon->ends != NULL && recon->iteration == 0)
 		failed = ends_begin(recon->ends, recon->backend, recon->volume, err);
+	if (failed == 0 && !last)
+		failed = begin_restraint(recon, err);
 	if (failed == 0 && !last)
 		failed = begin_stopping(recon, err);
 	if (failed < 0)

@@ -226,3 +226,20 @@ void warn_settled(const struct warning_sink *sink, const struct recipe *recipe, 
 		    "less of its change than the one before",
 		    (int)from + 1, recipe_iterations(recipe));
 }
+
+void warn_restraint(const struct warning_sink *sink, const struct recipe *recipe, const struct restraint_report *report)
+{
+	const double hu = recipe->mu_water / 1000, much = 0.01;
+
+	if (report->share < 1)
+		warning_tell(sink, "iterations_held_back",
+			     "in the quietest quarter of the object neighbouring voxels differ by %.3g HU before the "
+			     "iterations and by %.3g HU after them: kept volumes have %.0f %% of what the iterations "
+			     "changed",
+			     report->rough[0] / hu, report->rough[1] / hu, 100 * report->share);
+	if (report->restored > much)
+		warning_tell(sink, "noise_beside_metal",
+			     "smoothing moved the means of %.3g %% of the object by more than 25 HU beside FDK's: "
+			     "kept volumes have that back, up to %.0f HU",
+			     100 * report->restored, report->most / hu);
+}

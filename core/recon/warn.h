@@ -6,6 +6,7 @@
 #include "core/recon/ends.h"
 #include "core/recon/noise.h"
 #include "core/recon/recon.h"
+#include "core/recon/restraint.h"
 #include "core/warning.h"
 
 /* Warnings of a reconstruction, in words; those of its corrections are in their rows. For core/ only. */
@@ -34,6 +35,9 @@ void warn_settled(const struct warning_sink *sink, const struct recipe *recipe, 
 /* "slices_smoothed": what alternated from slice to slice, seen by no view, was more than a little. */
 void warn_alternation(const struct warning_sink *sink, const struct recipe *recipe,
 		      const struct alternation_report *report);
+/* "iterations_held_back" and "noise_beside_metal": what the restraint has changed. */
+void warn_restraint(const struct warning_sink *sink, const struct recipe *recipe,
+		    const struct restraint_report *report);
 /* "slices_smoothed": kept volumes are means over so many slices (thin.h). */
 void warn_thin(const struct warning_sink *sink, double width);
 #endif

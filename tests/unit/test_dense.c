@@ -26,13 +26,17 @@ static const struct {
 	const char *what;
 	int rods;
 	double radius, from_axis, water; /* mm, mm, of water's attenuation */
-	bool told;
+	const char *told;
 } tries[] = {
-    {"at the side of the grid", 1, 5, 95, 17, true},
-    {"screws", 2, 3, 50, 17, true},
-    {"vessels with contrast", 2, 4, 40, 1.6, false},
-    {"a skull that is denser than any", 0, 0, 0, 0, false},
+    {"at the side of the grid", 1, 5, 95, 17, "rays_left_out: "},
+    {"screws", 2, 3, 50, 17, "rays_left_out: "},
+    {"vessels with contrast", 2, 4, 40, 1.6, NULL},
+    {"a skull that is denser than any", 0, 0, 0, 0, "very_dense: "},
+    {"in the field of view, outside of the grid", 1, 5, 115, 17, "iterations_held_back: "},
+    {"outside of both", 1, 5, 130, 17, "iterations_held_back: "},
 };
+static const char *const codes[] = {
+    "rays_left_out: ", "very_dense: ", "iterations_held_back: ", "noise_beside_metal: "};
 /* Half of all rays pass it. Of its voxels a twentieth have 3.1 times water's attenuation in the FDK volume. */
 static const struct ellipsoid skull[] = {
     {SHAPE_CYLINDER, {85, 72, 250}, {2, 3, 0}, 0, 3.7 * .0192},
@@ -81,8 +85,8 @@ static struct recipe default_on(const struct grid *grid)
 	return recipe;
 }
 
-/* Root mean square error over what is neither air nor within 8 mm of a rod, HU. */
-static double error_of(int i, const struct grid *grid, const struct phantom *phantom, const float *volume,
+/* Root mean square error over what is neither air nor within 8 mm of a rod, or within the rods, HU. */
+static double error_of(int i, const struct grid *grid, const struct phantom *phantom, bool within, const float *volume,
 		       const float *truth)
 {
 	double squares = 0;
@@ -96,7 +100,9 @@ static double error_of(int i, const struct grid *grid, const struct phantom *pha
 				const double error = 1000 * ((double)volume[at] - (double)truth[at]) / MU_WATER;
 				bool counts = (double)truth[at] > 0.2 * MU_WATER && hypot(place[0], place[1]) < 100;
 
-				for (int k = BODY_PARTS; k < phantom->count; k++)
+				if (within)
+					counts = (double)truth[at] > 0.9 * tries[i].water * MU_WATER;
+				for (int k = within ? phantom->count : BODY_PARTS; k < phantom->count; k++)
 					counts = counts &&
 						 hypot(place[0] - phantom->parts[k].centre[0],
 						       place[1] - phantom->parts[k].centre[1]) > tries[i].radius + 8;
@@ -106,7 +112,10 @@ static double error_of(int i, const struct grid *grid, const struct phantom *pha
 	return sqrt(squares / (double)voxels);
 }
 
-/* Iterations were worse than FDK by up to a sixth beside one rod, and by a fifth between screws. */
+/*
+ * Iterations were worse than FDK by up to a sixth beside one rod, by a fifth between screws, and by an eighth beside a
+ * rod outside of the grid. The rods themselves, whose rays are left out, were moved away from FDK's by the other rays.
+ */
 START_TEST(iterations_beside_rods_are_no_worse_than_fdk)
 {
 	const struct grid grid = grid_of(64, 64, 8, 3.336, 3.336, 3.336);
@@ -118,6 +127,7 @@ START_TEST(iterations_beside_rods_are_no_worse_than_fdk)
 	struct outcome outcome = {0};
 	struct scene scene;
 	double fdk, last;
+	bool within = false;
 
 	ck_assert_ptr_nonnull(truth);
 	scan_of(&scene, &phantom);
@@ -125,14 +135,71 @@ START_TEST(iterations_beside_rods_are_no_worse_than_fdk)
 	recipe.emit = emit;
 	recipe.emits = 1;
 	run(&scene, &recipe, &outcome);
-	fdk = error_of(_i, &grid, &phantom, outcome_volume(&outcome, "fdk"), truth);
-	last = error_of(_i, &grid, &phantom, outcome_volume(&outcome, "final"), truth);
-	ck_assert_msg(last < fdk, "%s: FDK %.1f HU, default %.1f HU", tries[_i].what, fdk, last);
-	ck_assert_msg((strstr(outcome.warnings, "rays_left_out: ") != NULL) == tries[_i].told, "%s: %s", tries[_i].what,
-		      outcome.warnings);
+	do {
+		fdk = error_of(_i, &grid, &phantom, within, outcome_volume(&outcome, "fdk"), truth);
+		last = error_of(_i, &grid, &phantom, within, outcome_volume(&outcome, "final"), truth);
+		/* What is FDK's again has passed through another sum of floats. */
+		ck_assert_msg(last < 1.0001 * fdk, "%s%s: FDK %.2f HU, default %.2f HU",
+			      within ? "within what is " : "", tries[_i].what, fdk, last);
+		within = !within && tries[_i].rods > 0 && tries[_i].from_axis < 106;
+	} while (within);
+	for (int k = 0; k < COUNT(codes); k++)
+		ck_assert_msg((strstr(outcome.warnings, codes[k]) != NULL) ==
+				  (tries[_i].told != NULL && strcmp(tries[_i].told, codes[k]) == 0),
+			      "%s: %s", tries[_i].what, outcome.warnings);
 	outcome_clear(&outcome);
 	scene_clear(&scene);
 	free(truth);
+}
+END_TEST
+
+/* A steel cup, a tenth of the body and more, and bone 15 mm beside it. */
+static const struct ellipsoid cup[] = {
+    {SHAPE_ELLIPSOID, {65, 50, 70}, {0, 0, 0}, 0, .0192},
+    {SHAPE_ELLIPSOID, {34, 34, 34}, {-14, 0, 0}, 0, 17 * .0192},
+    {SHAPE_ELLIPSOID, {30, 30, 30}, {-14, 0, 0}, 0, -17 * .0192},
+    {SHAPE_ELLIPSOID, {8, 14, 25}, {44, 5, 0}, 0, .8 * .0192},
+};
+
+static void scan_of_cup(struct scene *ret_scene)
+{
+	const struct orbit_spec spec = {64, 40, 48, {600, 1000, {4.2, 4.2}, {0, 0}, {0, 0}}, 0, 7.5};
+	struct ellipsoid parts[COUNT(cup)];
+
+	memcpy(parts, cup, sizeof(cup));
+	scene_orbit(ret_scene, &spec);
+	scene_add(ret_scene, &(struct phantom){COUNT(cup), parts});
+}
+
+/* The bone's mean, HU. */
+static double bone_of(const struct grid *grid, const float *volume)
+{
+	const struct ellipsoid *bone = &cup[COUNT(cup) - 1];
+
+	return 1000 * (mean_near(volume, grid, bone->centre, 6) / MU_WATER - 1);
+}
+
+/* The cup's edges were taken for noise, and TV took 700 of the bone's 800 HU. Nobody was told of the cup. */
+START_TEST(bone_beside_a_lot_of_metal_is_what_fdk_has_of_it)
+{
+	const struct grid grid = grid_of(56, 48, 28, 2.52, 2.52, 2.52);
+	struct recipe recipe = default_on(&grid);
+	int emit[] = {EMIT_FDK};
+	struct outcome outcome = {.threads = 1};
+	struct scene scene;
+	double fdk, last;
+
+	scan_of_cup(&scene);
+	recipe.emit = emit;
+	recipe.emits = 1;
+	run(&scene, &recipe, &outcome);
+	fdk = bone_of(&grid, outcome_volume(&outcome, "fdk"));
+	last = bone_of(&grid, outcome_volume(&outcome, "final"));
+	ck_assert_msg(last > fdk - 25 && last < fdk + 25, "FDK %.0f HU, default %.0f HU", fdk, last);
+	ck_assert_ptr_nonnull(strstr(outcome.warnings, "very_dense: "));
+	expect_same_after_a_yield(&scene, &recipe, 2, &outcome);
+	outcome_clear(&outcome);
+	scene_clear(&scene);
 }
 END_TEST
 
@@ -160,6 +227,7 @@ Suite *dense_suite(void)
 
 	tcase_set_timeout(tests, 0);
 	tcase_add_loop_test(tests, iterations_beside_rods_are_no_worse_than_fdk, 0, COUNT(tries));
+	tcase_add_test(tests, bone_beside_a_lot_of_metal_is_what_fdk_has_of_it);
 	tcase_add_test(tests, rays_are_left_out_to_the_same_bits_with_other_threads_and_after_a_yield);
 	suite_add_tcase(suite, tests);
 	return suite;
