@@ -350,17 +350,22 @@ static void look_along(const struct look *look, const struct grid *grid, const s
 		return;
 	for (int x = next_of_line(look, grid, line, 0); x < grid->size[0]; x = next_of_line(look, grid, line, x + 1)) {
 		const struct place place = place_of(grid, x, y, z);
+		const size_t at = line + (size_t)x;
 		double column, row;
 
+		if (look->seen != NULL && look->empty[at] && !look->seen[at])
+			continue; /* the view can say no more of it */
 		view_project(shadow->matrix, place.at, &column, &row);
 		if (look->seen != NULL && (row < -0.5 || row > rows - 0.5))
-			look->seen[line + (size_t)x] = false;
+			look->seen[at] = false;
 		if (!(column >= 1 && row >= 1 && column <= columns - 2 && row <= rows - 2))
 			continue;
 		if (look->met != NULL)
-			look->met[line + (size_t)x] = true;
-		if (shadow->matter[(size_t)lround(row) * (size_t)columns + (size_t)lround(column)] < 0.5f)
-			look->empty[line + (size_t)x] = true;
+			look->met[at] = true;
+		/* Halves are rounded up: of what is 1 or more, the same pixel as lround's, without a call. */
+		if (!look->empty[at] &&
+		    shadow->matter[(size_t)(row + 0.5) * (size_t)columns + (size_t)(column + 0.5)] < 0.5f)
+			look->empty[at] = true;
 	}
 }
 
