@@ -125,6 +125,13 @@ static inline bool recipe_has_rim(const struct recipe *recipe)
 /* Calls the hook at the beginning of what `stage` says. */
 void recon_tell_progress(struct recon *recon, enum stage stage, int iteration);
 
+/*
+ * Makes of the iterate what a volume that is kept has of it, and its norms where that differs; warns of it once the
+ * iterations have ended. recon_hide gives the iterate back, and takes out what corrections have shown, too.
+ */
+int recon_show(struct recon *recon, struct volume_norms *norms, struct error *err);
+int recon_hide(struct recon *recon, struct error *err);
+
 /* True if all projections are kept on the device, and not a batch of FDK's at a time. */
 bool keeps_projections(const struct recipe *recipe);
 /* True if the recipe's algorithm is the backend's own update over ordered subsets. */

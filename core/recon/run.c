@@ -11,7 +11,6 @@
 #include "core/correct/averaging.h"
 #include "core/recon/internal.h"
 #include "core/recon/noise.h"
-#include "core/recon/thin.h"
 #include "core/recon/warn.h"
 
 /* ---- hooks ---- */
@@ -72,112 +71,6 @@ int recon_resume_noise(struct recon *recon, const struct volume_noise *noise, st
 	return 0;
 }
 
-/* An iterate without what alternates from slice to slice unseen; `before`, which no iteration reads, has the iterate.
- */
-static int show_smoothed(struct recon *recon, struct volume_norms *norms, struct error *err)
-{
-	struct alternation_report report = {0};
-	int code;
-
-	if (recon->alternation == NULL || recon->iteration == 0)
-		return 0;
-	code = recon->backend->volume_copy(recon->before, recon->volume, err);
-	if (code == 0)
-		code = alternation_show(recon->alternation, recon->backend, recon->volume, &report, err);
-	recon->smoothed = report.much;
-	if (code == 0 && report.much)
-		code = measure(recon, NULL, norms, err);
-	if (code == 0 && recon->ended)
-		warn_alternation(&recon->warnings, &recon->recipe, &report);
-	return code;
-}
-
-/* An iterate of slices thinner than rows are apart, without the rows; `before`, which no iteration reads, has the
- * iterate. */
-static int show_thick(struct recon *recon, struct volume_norms *norms, struct error *err)
-{
-	const double width = thin_width(&recon->recipe, &recon->orbit);
-	int code = 0;
-
-	if (width == 0 || recon->iteration == 0)
-		return 0;
-	if (recon->alternation == NULL)
-		code = recon->backend->volume_copy(recon->before, recon->volume, err);
-	if (code == 0)
-		code = thin_show(width, recon->backend, recon->before, recon->volume, &recon->recipe.grid, err);
-	recon->smoothed = true;
-	if (code == 0)
-		code = measure(recon, NULL, norms, err);
-	if (code == 0 && recon->ended)
-		warn_thin(&recon->warnings, width);
-	return code;
-}
-
-/* The rim of the field of view as it is kept; `before`, which no iteration reads, has the iterate. */
-static int show_rim(struct recon *recon, struct volume_norms *norms, struct error *err)
-{
-	bool changed = false;
-	int code = 0;
-
-	if (rim_state_bytes(recon->rim) == 0 || recon->iteration == 0)
-		return 0;
-	if (recon->alternation == NULL && !recon->smoothed)
-		code = recon->backend->volume_copy(recon->before, recon->volume, err);
-	if (code == 0)
-		code = rim_show(recon->rim, recon->backend, recon->volume, &changed, err);
-	recon->smoothed = recon->smoothed || changed;
-	return code == 0 && changed ? measure(recon, NULL, norms, err) : code;
-}
-
-/* An iterate as near to its start as it has to be; `before`, which no iteration reads, has the iterate. */
-static int show_restrained(struct recon *recon, struct volume_norms *norms, struct error *err)
-{
-	struct restraint_report report = {0};
-	int code = 0;
-
-	if (restraint_state_bytes(recon->restraint) == 0 || recon->iteration == 0)
-		return 0;
-	if (recon->alternation == NULL && !recon->smoothed)
-		code = recon->backend->volume_copy(recon->before, recon->volume, err);
-	if (code == 0)
-		code = restraint_show(recon->restraint, recon->backend, recon->volume, recon->left_out_dense, &report,
-				      err);
-	recon->smoothed = recon->smoothed || report.changed;
-	if (code == 0 && report.changed)
-		code = measure(recon, NULL, norms, err);
-	if (code == 0 && recon->ended)
-		warn_restraint(&recon->warnings, &recon->recipe, &report);
-	return code;
-}
-
-/* The end slices of an iterate as they are kept; the last one's are told of where they are uncertain. */
-static int show_ends(struct recon *recon, struct volume_norms *norms, struct error *err)
-{
-	struct ends_report report = {0};
-	int code = 0;
-
-	if (recon->ends != NULL && recon->iteration > 0)
-		code = ends_show(recon->ends, recon->backend, recon->volume, &report, err);
-	if (code == 0 && report.changed)
-		code = measure(recon, NULL, norms, err);
-	if (code == 0 && recon->ended)
-		warn_ends(&recon->warnings, &recon->recipe, &report);
-	return code;
-}
-
-/* Takes out again what was shown in a volume while it was kept. */
-static int hide(struct recon *recon, struct error *err)
-{
-	int code = corrections_hide(&recon->corrections, err);
-
-	if (code == 0 && recon->ends != NULL)
-		code = ends_hide(recon->ends, recon->backend, recon->volume, err);
-	if (code == 0 && recon->smoothed)
-		code = recon->backend->volume_copy(recon->volume, recon->before, err);
-	recon->smoothed = false;
-	return code;
-}
-
 /* How far the volume, as it is kept, stands on what was measured. */
 static int find_support(struct recon *recon, struct volume_support *ret_support, struct error *err)
 {
@@ -208,15 +101,7 @@ static int keep(struct recon *recon, const char *name, const char *stage, struct
 	if (recon->hooks->keep == NULL)
 		return 0;
 	recon_tell_progress(recon, STAGE_SAVE, recon->iteration);
-	code = show_smoothed(recon, &kept.norms, err);
-	if (code == 0)
-		code = show_thick(recon, &kept.norms, err);
-	if (code == 0)
-		code = show_restrained(recon, &kept.norms, err);
-	if (code == 0)
-		code = show_rim(recon, &kept.norms, err);
-	if (code == 0)
-		code = show_ends(recon, &kept.norms, err);
+	code = recon_show(recon, &kept.norms, err);
 	if (code == 0)
 		code = corrections_show(&recon->corrections, &kept.estimate_mm, err);
 	if (code == 0 && kept.estimate_mm > 0)
@@ -225,7 +110,7 @@ static int keep(struct recon *recon, const char *name, const char *stage, struct
 		code = find_support(recon, &kept.support, err);
 	if (code == 0)
 		code = recon->hooks->keep(recon->hooks->context, recon, &kept, err);
-	return code < 0 ? code : hide(recon, err);
+	return code < 0 ? code : recon_hide(recon, err);
 }
 
 /* ---- the run ---- */
