@@ -19,19 +19,21 @@ mkdir -p "$out"
 results=$BUILD/test/results
 : >"$results"
 
-# Parts take from a second to two minutes. The longest begin first, so that none of them is left alone on one processor
-# at the end.
+# Parts take from a second to nine minutes. Suites begin as soon as there is a place for one, since more of the others
+# run at a time when none is left; of both, those that take longest begin first, so that none of them is left alone on
+# one processor at the end.
 if [ "${1:-}" = --soak ]; then
 	shift
 	parts=(tests/soak/test_*.sh)
 	places_without_suites=$JOBS
 else
-	parts=(tests/http/test_fleet.sh tests/http/test_restart.sh unit/recon unit/exterior tests/http/test_devices_of_a_job.sh
-		unit/study tests/web/test_page.sh unit/outofcore tests/http/test_job.sh tests/http/test_faulty_device.sh unit/metal
-		tests/http/test_real.sh unit/backend tests/http/test_supervise.sh tests/http/test_fleet_network.sh
-		tests/http/test_arriving.sh tests/http/test_metal.sh tests/http/test_phantom.sh lint)
+	parts=(unit/recon unit/study unit/exterior unit/outofcore unit/metal unit/algorithm unit/stuck unit/detector unit/noise
+		unit/backend)
+	begin_with=(fleet devices_of_a_job restart page postgresql empty_views job faulty_device refine real damage arriving
+		scatter supervise memory dimse send patient dicom rings phantom events)
 	rest=$("$BUILD/unit" --list | sed 's,^,unit/,') || exit 1
-	for part in $rest tests/http/test_*.sh tests/web/test_*.sh; do
+	for part in "${begin_with[@]}"; do rest+=" tests/http/test_$part.sh tests/web/test_$part.sh"; done
+	for part in $rest tests/http/test_*.sh tests/web/test_*.sh lint; do
 		[[ " ${parts[*]} " == *" $part "* ]] || parts+=("$part")
 	done
 fi
