@@ -312,6 +312,13 @@ static int push_view(struct recon *recon, const void *samples, int view, struct 
 	return fdk_add(&recon->fdk, view, slot, recon->projections, recon->volume, err);
 }
 
+void recon_tell_progress(struct recon *recon, enum stage stage, int iteration)
+{
+	recon->fraction = fmax(recon->fraction, fmin(1, recon->work_done / recon->work_total));
+	if (recon->hooks->progress != NULL)
+		recon->hooks->progress(recon->hooks->context, stage, iteration, recon->fraction);
+}
+
 int recon_push(struct recon *recon, const void *samples, const int *views, int count, struct error *err)
 {
 	const size_t view_bytes = input_view_bytes(&recon->input);

@@ -15,13 +15,6 @@
 
 /* ---- hooks ---- */
 
-void recon_tell_progress(struct recon *recon, enum stage stage, int iteration)
-{
-	recon->fraction = fmax(recon->fraction, fmin(1, recon->work_done / recon->work_total));
-	if (recon->hooks->progress != NULL)
-		recon->hooks->progress(recon->hooks->context, stage, iteration, recon->fraction);
-}
-
 static bool is_wanted(const struct recipe *recipe, int emit)
 {
 	for (int i = 0; i < recipe->emits; i++)
