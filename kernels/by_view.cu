@@ -75,7 +75,7 @@ static __global__ void __launch_bounds__(32 * PARTS_MOST, ROWS > 4 || LEAN ? 3 :
 		if (!__any_sync(~0u, mine))
 			continue;
 		slice_axes axes = axes_of(s.grid, axis);
-		fan f = fan_make<ROWS, LEAN>(g, d, m, axis, upwards, axes);
+		fan f = fan_make<KIND, ROWS, LEAN>(g, d, m, axis, upwards, axes);
 		shared_row_ends<ROWS> ends = {own_sums + ROWS * 32};
 		float sum[ROWS] = {};
 		reach reaches = reach_of<ROWS, LEAN>(f, mine, low, s.rows, axes, ends);
@@ -100,7 +100,7 @@ static __global__ void __launch_bounds__(32 * PARTS_MOST, ROWS > 4 || LEAN ? 3 :
 				float fast = fmaf(i, f.fast_step, f.fast);
 				p.odd = base & 1;
 				if (LEAN) {
-					p.lean = lean_at(f, i, p.e);
+					p.lean = lean_at<KIND>(f, i, p.e);
 					fast = fmaf((float)(pairs - p.odd) - 0.5f - p.t, p.lean, fast);
 				}
 				p.at = split(held<GUARD>(fast, axes), p.right) - 1 + (base >> 1) * pair;
@@ -352,7 +352,9 @@ size_t copies_bytes(const struct plan *plan)
 /* Rows of a thread: few where what a view sees of the grid would not fill the card. */
 int copies_view_rows(const struct plan *plan)
 {
-	const int warps_least = 500, few = plan->shape.untilted ? 2 : 3; /* those that lean share more */
+	/* Those that lean share more; three find their values if they are at least half a voxel apart. */
+	const bool halves = neighbours_spacing(plan->shape.forward_neighbours) <= 0.5f;
+	const int warps_least = 500, few = plan->shape.untilted || halves ? 2 : 3;
 	bool by_view = plan->strategy != NULL && plan->strategy->by_view;
 	int rows = plan->shape.forward_rows;
 
@@ -415,8 +417,8 @@ static void project_by(const struct plan *plan, const rows_view &s, int count, i
 {
 	const int rows = plan->shape.view_rows;
 
-	/* So few rows find their values however they are spaced. */
-	switch ((rows <= 3 ? NEIGHBOURS_EVEN : plan->shape.forward_neighbours) * 8 + rows) {
+	/* Fewer rows than in the forward projection find their values evenly. */
+	switch ((rows < plan->shape.forward_rows ? NEIGHBOURS_EVEN : plan->shape.forward_neighbours) * 8 + rows) {
 	case NEIGHBOURS_EVEN * 8 + 2:
 		return launch_rows<NEIGHBOURS_EVEN, 2>(plan, s, count, views, stream);
 	case NEIGHBOURS_EVEN * 8 + 3:
@@ -427,6 +429,12 @@ static void project_by(const struct plan *plan, const rows_view &s, int count, i
 		return launch_rows<NEIGHBOURS_EVEN, 5>(plan, s, count, views, stream);
 	case NEIGHBOURS_NARROW * 8 + 6:
 		return launch_rows<NEIGHBOURS_NARROW, 6>(plan, s, count, views, stream);
+	case NEIGHBOURS_CLOSE * 8 + 4:
+		return launch_rows<NEIGHBOURS_CLOSE, 4>(plan, s, count, views, stream);
+	case NEIGHBOURS_THIRDS * 8 + 6:
+		return launch_rows<NEIGHBOURS_THIRDS, 6>(plan, s, count, views, stream);
+	case NEIGHBOURS_TWOS * 8 + 6:
+		return launch_rows<NEIGHBOURS_TWOS, 6>(plan, s, count, views, stream);
 	default:
 		return launch_rows<NEIGHBOURS_EVEN, 6>(plan, s, count, views, stream);
 	}

@@ -4,8 +4,8 @@
 /*
  * Neighbours along a line that are interpolated from few common values: rays of
  * rows below each other from voxels along z, voxels along z from rows of the detector.
- * COUNT neighbours lie 1 + e values apart (1/2 + e where two go to a value). Neighbour k
- * takes the values x[j], x[j + 1] and x[j + 2], j = neighbours_begin(k); it lies t above
+ * COUNT neighbours lie 1 + e values apart, and less where several go to a value: their kind's
+ * spacing + e. Neighbour k takes the values x[j], x[j + 1] and x[j + 2], j = neighbours_begin(k); it lies t above
  * x[j + 1], -1 <= t <= 1, and
  *   x[j + 1] + saturate(-t) (x[j] - x[j + 1]) + saturate(t) (x[j + 2] - x[j + 1])
  * is the linear interpolation without a branch or a dynamic index. x[0] is the floor of
@@ -14,30 +14,48 @@
 #include <cuda_fp16.h>
 
 enum neighbours {
-	NEIGHBOURS_EVEN,  /* j = 0 1 2 3 4 5 */
-	NEIGHBOURS_TWOS,  /* j = 0 0 1 1 2 */
-	NEIGHBOURS_WIDE,  /* j = 0 1 3 4 5, a little more than one apart */
-	NEIGHBOURS_NARROW /* j = 0 1 1 2 3 4, a little less */
+	NEIGHBOURS_EVEN,   /* j = 0 1 2 3 4 5 */
+	NEIGHBOURS_TWOS,   /* j = 0 0 1 1 2 2, half of one apart */
+	NEIGHBOURS_WIDE,   /* j = 0 1 3 4 5, a little more than one */
+	NEIGHBOURS_NARROW, /* j = 0 1 1 2 3 4, a little less */
+	NEIGHBOURS_CLOSE,  /* j = 0 0 1 2, less still */
+	NEIGHBOURS_THIRDS  /* j = 0 0 1 2 2 3, two thirds of one */
 };
 
 static __host__ __device__ constexpr int neighbours_begin(neighbours kind, int k)
 {
-	return kind == NEIGHBOURS_TWOS ? k / 2
-				       : k + (k < 2                       ? 0
-					      : kind == NEIGHBOURS_WIDE   ? 1
-					      : kind == NEIGHBOURS_NARROW ? -1
-									  : 0);
+	switch (kind) {
+	case NEIGHBOURS_TWOS:
+		return k / 2;
+	case NEIGHBOURS_WIDE:
+		return k + (k >= 2);
+	case NEIGHBOURS_NARROW:
+		return k - (k >= 2);
+	case NEIGHBOURS_CLOSE:
+		return k - (k >= 1);
+	case NEIGHBOURS_THIRDS:
+		return 2 * k / 3;
+	default:
+		return k;
+	}
+}
+
+static __host__ __device__ constexpr float neighbours_spacing(neighbours kind)
+{
+	switch (kind) {
+	case NEIGHBOURS_TWOS:
+		return 1.0f / 2;
+	case NEIGHBOURS_THIRDS:
+		return 2.0f / 3;
+	default:
+		return 1.0f;
+	}
 }
 
 /* Neighbour k lies k e + neighbours_offset(k) farther above its x[j] than the first. */
 static __host__ __device__ constexpr float neighbours_offset(neighbours kind, int k)
 {
-	return (float)k * (kind == NEIGHBOURS_TWOS ? 0.5f : 1.0f) - (float)neighbours_begin(kind, k);
-}
-
-static __host__ __device__ constexpr float neighbours_spacing(neighbours kind)
-{
-	return kind == NEIGHBOURS_TWOS ? 0.5f : 1.0f;
+	return (float)k * neighbours_spacing(kind) - (float)neighbours_begin(kind, k);
 }
 
 /* Common values that `count` neighbours take. */
@@ -53,6 +71,13 @@ static __host__ __device__ __forceinline__ float neighbours_lowest(neighbours ki
 		return fminf(0.0f, fmaf(2.0f, e, -1.0f));
 	if (kind == NEIGHBOURS_NARROW)
 		return fminf(e, fmaf((float)(count - 1), e, 1.0f));
+	if (kind == NEIGHBOURS_CLOSE)
+		return fminf(0.0f, fmaf((float)(count - 1), e, 1.0f));
+	/* Of those that begin together the first is the lowest. */
+	if (kind == NEIGHBOURS_TWOS)
+		count = (count - 1) / 2 * 2 + 1;
+	if (kind == NEIGHBOURS_THIRDS)
+		count = (count - 1) / 3 * 3 + 1;
 	return fminf(0.0f, (float)(count - 1) * e);
 }
 
@@ -69,14 +94,14 @@ static __device__ __forceinline__ __half2 pick(const __half2 *pairs, int i, int 
 template <neighbours KIND, int COUNT>
 static __device__ __forceinline__ void blend(const __half2 *x, float e, float t, __half2 value[(COUNT + 1) / 2])
 {
-	__half2 both = __float2half2_rn(e), first = __floats2half2_rn(t, t + (e + neighbours_offset(KIND, 1)));
+	__half2 both = __float2half2_rn(e), first = __floats2half2_rn(t, t + e);
 
 #pragma unroll
 	for (int n = 0; n < (COUNT + 1) / 2; n++) {
 		const int k = 2 * n, i = neighbours_begin(KIND, k),
 			  j = k + 1 < COUNT ? neighbours_begin(KIND, k + 1) : i + 1;
-		const float offset = neighbours_offset(KIND, k);
-		__half2 above = offset != 0 ? __hadd2(first, __float2half2_rn(offset)) : first;
+		const float offset = neighbours_offset(KIND, k), next = neighbours_offset(KIND, k + 1);
+		__half2 above = offset != 0 || next != 0 ? __hadd2(first, __floats2half2_rn(offset, next)) : first;
 		__half2 here = pick(x, i + 1, j + 1), up = __hfma2_sat(both, __float2half2_rn((float)k), above);
 		__half2 down = __hfma2_sat(both, __float2half2_rn((float)-k), __hneg2(above));
 

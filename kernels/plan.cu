@@ -173,9 +173,9 @@ struct neighbours_choice {
 	enum neighbours kind;
 	int count;
 };
-static const neighbours_choice forward_neighbours[] = {{NEIGHBOURS_EVEN, 6},   {NEIGHBOURS_EVEN, 5},
-						       {NEIGHBOURS_NARROW, 6}, {NEIGHBOURS_EVEN, 4},
-						       {NEIGHBOURS_EVEN, 3},   {NEIGHBOURS_EVEN, 0}};
+static const neighbours_choice forward_neighbours[] = {
+    {NEIGHBOURS_TWOS, 6}, {NEIGHBOURS_THIRDS, 6}, {NEIGHBOURS_EVEN, 6}, {NEIGHBOURS_EVEN, 5}, {NEIGHBOURS_NARROW, 6},
+    {NEIGHBOURS_EVEN, 4}, {NEIGHBOURS_CLOSE, 4},  {NEIGHBOURS_EVEN, 3}, {NEIGHBOURS_EVEN, 0}};
 static const neighbours_choice back_neighbours[] = {{NEIGHBOURS_TWOS, 5},   {NEIGHBOURS_EVEN, 6}, {NEIGHBOURS_EVEN, 5},
 						    {NEIGHBOURS_NARROW, 5}, {NEIGHBOURS_WIDE, 5}, {NEIGHBOURS_EVEN, 4},
 						    {NEIGHBOURS_WIDE, 4},   {NEIGHBOURS_EVEN, 3}, {NEIGHBOURS_EVEN, 0}};
@@ -832,7 +832,10 @@ void plan_end_slices(struct plan *plan)
 	owner_of_scratch(plan)->slices_of = NULL;
 }
 
-static const char *const neighbours_names[] = {"", ", two a row", ", wide", ", narrow"};
+static const char *const neighbours_names[] = {"",        ", two a row", ", wide",       ", narrow",
+					       ", close", ", thirds",    ", three a row"};
+static const char *const forward_names[] = {"",        ", two a voxel", ", wide",         ", narrow",
+					    ", close", ", thirds",      ", three a voxel"};
 
 /* The rows of the tables that were chosen, and what they go by. */
 static void summarise(struct plan *plan)
@@ -842,8 +845,8 @@ static void summarise(struct plan *plan)
 	char rows[64] = "", back[96] = "", saves[32] = "";
 
 	if (shape->forward_rows > 0)
-		snprintf(rows, sizeof(rows), ", %s, %d rows a thread", shape->untilted ? "untilted" : "near untilted",
-			 shape->forward_rows);
+		snprintf(rows, sizeof(rows), ", %s, %d rows a thread%s", shape->untilted ? "untilted" : "near untilted",
+			 shape->forward_rows, shape->rows_apart ? "" : forward_names[shape->forward_neighbours]);
 	if (shape->back_voxels > 0)
 		snprintf(back, sizeof(back), ", %s, %d voxels a window%s",
 			 shape->untilted ? "untilted" : "near untilted", shape->back_voxels,

@@ -305,7 +305,7 @@ static __device__ __forceinline__ void add_slices(const __half2 *at, const slice
 		int low = lowest_row<KIND, ROWS, GUARD>(f, i, s.e, axes, s.t);
 		float fast = fmaf(i, f.fast_step, f.fast);
 		if (LEAN) {
-			s.lean = lean_at(f, i, s.e);
+			s.lean = lean_at<KIND>(f, i, s.e);
 			fast = fmaf((float)pairs - 1.5f - s.t, s.lean, fast);
 		}
 		s.at = low * PANEL + first_column(held<GUARD>(fast, axes), across.panel, s.right);
@@ -422,7 +422,7 @@ static __global__ void __launch_bounds__(32 * ROWS_WARPS * ROWS_VIEWS, 32 / (ROW
 		if (!__any_sync(~0u, mine))
 			continue;
 		slice_axes axes = axes_of(p.grid, axis);
-		fan f = fan_make<ROWS, LEAN>(g, d, m, axis, upwards, axes);
+		fan f = fan_make<KIND, ROWS, LEAN>(g, d, m, axis, upwards, axes);
 		row_ends<ROWS> ends;
 		float sum[ROWS] = {};
 		reach r = reach_of<ROWS, LEAN>(f, mine, low, p.rows, axes, ends);
@@ -513,6 +513,12 @@ static void launch_rows(const struct plan *plan, const projection &p, unsigned b
 		return launch_neighbours<NEIGHBOURS_EVEN, 5>(shape, p, blocks, stream);
 	case NEIGHBOURS_NARROW * 8 + 6:
 		return launch_neighbours<NEIGHBOURS_NARROW, 6>(shape, p, blocks, stream);
+	case NEIGHBOURS_CLOSE * 8 + 4:
+		return launch_neighbours<NEIGHBOURS_CLOSE, 4>(shape, p, blocks, stream);
+	case NEIGHBOURS_THIRDS * 8 + 6:
+		return launch_neighbours<NEIGHBOURS_THIRDS, 6>(shape, p, blocks, stream);
+	case NEIGHBOURS_TWOS * 8 + 6:
+		return launch_neighbours<NEIGHBOURS_TWOS, 6>(shape, p, blocks, stream);
 	default:
 		return launch_neighbours<NEIGHBOURS_EVEN, 6>(shape, p, blocks, stream);
 	}

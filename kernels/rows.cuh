@@ -4,8 +4,8 @@
 /*
  * The rays of ROWS neighbouring rows in one column of the detector, where rows run
  * across z. They share their way across the rows' direction, and in every slice
- * they are evenly spaced along z, 1 + e voxels apart: neighbours with few common
- * values (neighbours.cuh), which are interpolated across once.
+ * they are evenly spaced along z: neighbours with few common values (neighbours.cuh),
+ * which are interpolated across once.
  *
  * In half precision, two neighbours along z a register. Where the rows LEAN, by a
  * degree or so, each pair across counts with its own weights, on the tangent of
@@ -15,7 +15,10 @@
 
 #include "kernels/rays.cuh"
 
-/* A column's rays: row k, counted upwards, crosses slice i at row + i row_step + k (1 + spread + i spread_step). */
+/*
+ * A column's rays: row k, counted upwards, crosses slice i at row + i row_step + k (spacing + spread + i spread_step),
+ * the spacing being that of the kind of neighbours.
+ */
 struct fan {
 	float fast, fast_step, row, row_step, spread, spread_step;
 	float lean, lean_step;           /* and steps aside by k (lean + i lean_step) */
@@ -51,9 +54,10 @@ static __device__ __forceinline__ int lowest_row(const fan &f, float i, float e,
 }
 
 /* How the fast coordinate changes along z in slice i. */
+template <neighbours KIND>
 static __device__ __forceinline__ float lean_at(const fan &f, float i, float e)
 {
-	return fmaf(i, f.lean_step, f.lean) * reciprocal(1.0f + e);
+	return fmaf(i, f.lean_step, f.lean) * reciprocal(neighbours_spacing(KIND) + e);
 }
 
 /* Where a fan crosses a slice. */
@@ -197,7 +201,7 @@ static __device__ __forceinline__ void row_range(const fan &f, int k, const slic
  * The fan above a ray. Row k divides by another depth, d + k rise, where rows lean;
  * over so few rows the straight line from the first to the last is it.
  */
-template <int ROWS, bool LEAN>
+template <neighbours KIND, int ROWS, bool LEAN>
 static __device__ __forceinline__ fan fan_make(const device_view &g, const float d[3], const float m[3], int axis,
 					       float upwards, const slice_axes &axes)
 {
@@ -221,7 +225,7 @@ static __device__ __forceinline__ fan fan_make(const device_view &g, const float
 	f.lean_step = LEAN ? (g.direction[x ? 1 : 0][2] - cross.fast_step * rise) * inverse : 0.0f;
 	f.fast = fmaf(-middle, f.fast_step, cross.fast + 0.5f * (float)(axes.fast - 1));
 	f.row = fmaf(-middle, f.row_step, f.middle_row + 0.5f * (float)(axes.rows - 1));
-	f.spread = fmaf(-middle, f.spread_step, f.middle_spread) - 1.0f;
+	f.spread = fmaf(-middle, f.spread_step, f.middle_spread) - neighbours_spacing(KIND);
 	f.lean = fmaf(-middle, f.lean_step, f.middle_lean);
 	return f;
 }

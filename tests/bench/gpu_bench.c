@@ -82,6 +82,16 @@ static const struct bench_case cases[] = {
       .spacing = {.0931, .0931, .0931}},
      1,
      229},
+    {'F', /* D's detector, and voxels as a job of the whole field of view takes them */
+     {.columns = 1240,
+      .rows = 960,
+      .views = 496,
+      .arc = 200 * DEGREE,
+      .pixel = {.308, .308},
+      .size = {512, 512, 512},
+      .spacing = {.25, .25, .25}},
+     1,
+     0},
 };
 
 static FILE *json;
@@ -550,7 +560,7 @@ static void read_ceilings(const char *path)
 
 int main(int argc, char **argv)
 {
-	const char *wanted = "ABCDET";
+	const char *wanted = "ABCDEFT";
 	struct device_info info;
 	struct error err = {0};
 
