@@ -11,6 +11,7 @@
 #include "daemon/files.h"
 #include "daemon/lock.h"
 #include "daemon/log.h"
+#include "proto/calibration.h"
 #include "proto/clock.h"
 
 enum { ARM_MOST = 255 }; /* characters */
@@ -457,7 +458,43 @@ int calibrations_post(struct calibrations *calibrations, const char *client, con
 	return code;
 }
 
-/* Scan, sweep and times of a refinement; its geometry has all of the scan's views. */
+/* The sweep of the views that a refinement had, where the scan lacks others: their places as the scan has them. */
+static int sweep_of_some(const struct scan *scan, const cJSON *refinement, cJSON **ret_sweep, struct error *err)
+{
+	const cJSON *list = cJSON_GetObjectItemCaseSensitive(refinement, "views"), *view;
+	cJSON *sweep = cJSON_CreateObject(), *projections = cJSON_AddObjectToObject(sweep, "projections");
+	struct view *views = malloc((size_t)scan->count * sizeof(*views));
+	int count = 0, code = 0;
+
+	if (views == NULL || projections == NULL)
+		code = error_set(err, ERR_NO_MEMORY, "no memory for %d views", scan->count);
+	cJSON_ArrayForEach(view, list)
+	{
+		const cJSON *projection = cJSON_GetObjectItemCaseSensitive(view, "projection");
+		const int index = cJSON_IsNumber(projection) ? projection->valueint : -1;
+
+		if (code == 0 && (index < 0 || index >= scan->count || count == scan->count))
+			code = error_set(err, ERR_DAMAGED, "what was refined names projection %d of %d", index,
+					 scan->count);
+		if (code == 0)
+			views[count++] = scan->geometry.views[index];
+	}
+	if (code == 0) {
+		cJSON_AddNumberToObject(projections, "count", count);
+		cJSON_AddStringToObject(projections, "sample", "float32");
+		cJSON_AddStringToObject(projections, "quantity", "line_integral");
+		json_add(sweep, "detector",
+			 cJSON_Duplicate(cJSON_GetObjectItemCaseSensitive(scan->document, "detector"), true));
+		json_add(sweep, "geometry", matrices_json(views, count));
+		*ret_sweep = sweep;
+	} else {
+		cJSON_Delete(sweep);
+	}
+	free(views);
+	return code;
+}
+
+/* Scan, sweep and times of a refinement. */
 static int describe_kept(struct calibrations *calibrations, const struct calibration_kept *kept, cJSON *request,
 			 struct error *err)
 {
@@ -465,6 +502,7 @@ static int describe_kept(struct calibrations *calibrations, const struct calibra
 	const int views = cJSON_GetArraySize(cJSON_GetObjectItemCaseSensitive(geometry, "matrices"));
 	struct scan_facts facts;
 	struct stored_scan *scan;
+	cJSON *sweep = NULL;
 	int code = store_scan_find(calibrations->store, kept->scan, &scan, err);
 
 	if (code == ERR_NOT_FOUND)
@@ -475,9 +513,9 @@ static int describe_kept(struct calibrations *calibrations, const struct calibra
 		return code;
 	stored_scan_facts(scan, &facts);
 	if (views != facts.count)
-		code = error_set_at(err, ERR_CONFLICT, "/job",
-				    "the job had %d of the scan's %d views, a calibration needs all of them", views,
-				    facts.count);
+		code = sweep_of_some(stored_scan_parsed(scan), kept->refinement, &sweep, err);
+	else
+		sweep = cJSON_Duplicate(stored_scan_parsed(scan)->document, true);
 	cJSON_AddStringToObject(request, "scan", kept->scan);
 	cJSON_AddStringToObject(request, "job", kept->job);
 	cJSON_AddBoolToObject(request, "adjust_balls", false);
@@ -487,7 +525,7 @@ static int describe_kept(struct calibrations *calibrations, const struct calibra
 		cJSON_AddNullToObject(request, "arm");
 	cJSON_AddNumberToObject(request, "created", clock_realtime());
 	cJSON_AddNumberToObject(request, "acquired", facts.created);
-	json_add(request, "sweep", cJSON_Duplicate(stored_scan_parsed(scan)->document, true));
+	json_add(request, "sweep", sweep);
 	stored_scan_release(scan);
 	return code;
 }

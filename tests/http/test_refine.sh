@@ -146,6 +146,29 @@ test_a_refined_geometry_is_kept_for_the_arm_s_next_scan() {
 	expect_number "$(jq -n "($kept - $true) / ($nominal - $true)")" '<' 0.5 "the share of the circle's error above the true views' that stays"
 }
 
+# Two of its views never come: those that did are kept, and a scan has the places of the others between them.
+test_a_scan_that_lacks_views_is_kept_with_those_it_has() {
+	local bytes=$((48 * 40 * 4)) run calibration
+	post_scan "$work/wanders"
+	for run in 0-9 11-40 42-63; do
+		dd if="$work/wanders/projections.raw" of="$work/run" bs=$bytes skip=${run%-*} count=$((${run#*-} - ${run%-*} + 1)) status=none
+		req PUT "/v1/scans/$scan/projections/$run" --data-binary @"$work/run"
+		expect_status 201
+	done
+	req POST "/v1/scans/$scan/complete"
+	post_job "$recipe"'"fdk": {}, "refine": {"geometry": true}}'
+	wait_job succeeded
+	told geometry_refined
+	keep "$job"
+	expect_status 202
+	calibration=$(jq -r .id "$body")
+	expect_json '.state == "succeeded" and .sweep.views == 62 and (.geometry.matrices | length) == 62'
+	jq -c ".geometry = {kind: \"calibration\", id: \"$calibration\", first_angle_deg: 0, angle_step_deg: (210 / 63)}" "$work/fits/scan.json" >"$work/by-angle.json"
+	req POST /v1/scans -H 'Content-Type: application/json' --data-binary @"$work/by-angle.json"
+	expect_status 201
+	expect_json '(.geometry.matrices | length) == 64 and any(.warnings[]; .code == "calibration_interpolated")'
+}
+
 refer() { # JOB [GRID]: a job of $scan that refines with that one's volume
 	req POST /v1/jobs -H 'Content-Type: application/json' -d "{\"scan\": \"$scan\", ${2:-$grid}, \"fdk\": {}, \"refine\": {\"geometry\": true, \"reference\": {\"job\": \"$1\"}}}"
 }
