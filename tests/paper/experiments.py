@@ -138,13 +138,13 @@ RUNS = [
         for scan in ("arm", "arm-binned")
         for run in (
             Run(f"{scan}-default", scan, "FDK, 10 subsets, TV of the noise found", {"fdk": {}, **_sart(30, 10), "tv": {}}, ("fdk", 10, 30), True, part="better"),
-            Run(f"{scan}-momentum", scan, "the same, momentum", {"fdk": {}, **_sart(8, 10, momentum=True), "tv": {}}, (4, 8), True, part="better"),
-            Run(f"{scan}-strong", scan, "the same, strong TV", {"fdk": {}, **_sart(8, 10, momentum=True), "tv": {"strength": "strong"}}, (8,), True, part="better"),
+            Run(f"{scan}-momentum", scan, "FDK, 10 subsets, momentum, TV of the noise found", {"fdk": {}, **_sart(8, 10, momentum=True), "tv": {}}, (4, 8), True, part="better"),
+            Run(f"{scan}-strong", scan, "FDK, 10 subsets, momentum, strong TV", {"fdk": {}, **_sart(8, 10, momentum=True), "tv": {"strength": "strong"}}, (8,), True, part="better"),
             Run(f"{scan}-fista", scan, "FISTA, TV of the noise found", {"fdk": {}, "fista": {"iterations": 20}, "tv": {}}, (20,), True, part="better"),
         )
     ),
     Run("arm-blocks", "arm", "2 x 2 pixels as one, momentum, steps of TV", {"binning": 2, "fdk": {}, **_sart(20, 10, momentum=True), "tv": {"alpha": 1 / 0.7, "after": "sart"}}, (20,), True, part="better"),
-    Run("arm-blocks-light", "arm", "the same, light TV of the noise found", {"binning": 2, "fdk": {}, **_sart(20, 10, momentum=True), "tv": {"strength": "light"}}, (20,), True, part="better"),
+    Run("arm-blocks-light", "arm", "2 x 2 pixels as one, momentum, light TV of the noise found", {"binning": 2, "fdk": {}, **_sart(20, 10, momentum=True), "tv": {"strength": "light"}}, (20,), True, part="better"),
     # ---- iterations that end by themselves ----
     Run("fig5-auto", "fig5", "FDK, 10 subsets", {**RAM_LAK, **_auto(subsets=10)}, (), True, part="stop", twin="ten"),
     Run("fig7-auto", "fig7", "13 subsets", _auto(subsets=13), (), True, part="stop", twin="fig7-ordered"),
