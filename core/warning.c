@@ -163,8 +163,8 @@ const struct warning_kind warning_kinds[] = {
      "rely "
      "on gray values in it and beside it."},
     {"iterations_held_back", SEVERITY_CAUTION,
-     "Iterations put streaks into the image, as beside something dense that may lie outside of it: the result stays "
-     "nearer to the plain reconstruction, which has streaks, too."},
+     "Iterations would make the image rougher, by noise or by streaks, as of something dense outside of it: the result "
+     "stays nearer to the plain reconstruction."},
     {"noise_beside_metal", SEVERITY_CAUTION,
      "The image is very noisy, as beside a lot of metal: fine detail is smoothed away, and gray values are estimates."},
     {"iterations_settled", SEVERITY_INFO,
