@@ -13,7 +13,7 @@ positions="HFS HFP FFS FFP HFDL HFDR FFDL FFDR"
 tilted='{"world_to_patient": [0.766044443, -0.642787610, 0, 12, 0.620885352, 0.739941976, -0.258819045, -7, 0.166365675, 0.198266889, 0.965925826, 150, 0, 0, 0, 1]}'
 recipe='"grid": {"size": [41, 42, 43], "spacing_mm": [2, 2, 2], "origin_mm": [-40, -42, -41]}, "fdk": {}'
 
-member() { # POSITION: the value of "patient"
+value_of_patient() { # POSITION: the value of "patient"
 	case $1 in
 	unknown) echo null ;;
 	tilted) echo "$tilted" ;;
@@ -23,7 +23,7 @@ member() { # POSITION: the value of "patient"
 scan_of() { # POSITION DIR: the object, with that patient
 	mkdir -p "$2"
 	ln -sf "$work/scan/projections.raw" "$2/projections.raw"
-	jq -c --argjson patient "$(member "$1")" '.patient = $patient' "$work/scan/scan.json" >"$2/scan.json"
+	jq -c --argjson patient "$(value_of_patient "$1")" '.patient = $patient' "$work/scan/scan.json" >"$2/scan.json"
 }
 job_of() { # POSITION: a scan of it and a job that has ended
 	scan_of "$1" "$work/$1"
