@@ -209,6 +209,8 @@ export class JobPage {
 		if (ended(this.#job)) {
 			this.stopWatching?.()
 			this.live(null)
+			/* Of a job that has only just ended, digests and quality may be still to come. */
+			this.#refreshVolumes(30)
 			/* Its own events are over; what is measured in it goes on. */
 			this.stopListening ??= watch('/v1/events?after=latest', (kind, data) => data.job === this.id && this.#hearAfter(kind, data), connected => connected && this.annotations.load())
 			return
