@@ -5,8 +5,6 @@
 #include <fcntl.h>
 #include <limits.h>
 #include <math.h>
-#include <pthread.h>
-#include <stdatomic.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
@@ -15,12 +13,16 @@
 #include <unistd.h>
 
 #include "proto/clock.h"
-#include "proto/durable.h"
+#include "proto/saver.h"
 #include "proto/scan_directory.h"
 #include "proto/seal.h"
 
-enum { PIECE_BYTES = 8 << 20 }; /* voxels in one go on their way to the disk */
-static const double SHARE = 50; /* a copy takes at most one part in so many of the time */
+enum {
+	PIECE_BYTES = 8 << 20, /* voxels in one go on their way to the disk */
+	ROWS_AHEAD = 4096      /* of the history, that may come between a file's preparation and its use */
+};
+static const double SHARE = 50;        /* a copy takes at most one part in so many of the time */
+static const double SECONDS_AHEAD = 1; /* that a file is prepared before it is due */
 
 /* ---- the history ---- */
 
@@ -104,29 +106,22 @@ static void checkpoint_line(char ret_line[CHECKPOINT_FILE_OFFSET], int iteration
 	ret_line[CHECKPOINT_FILE_OFFSET - 1] = '\n';
 }
 
-/* A checkpoint on its way to the disk. */
-struct sealed_file {
-	struct durable file;
-	struct seal_maker seal;
-};
-
-static int write_sealed(struct sealed_file *sealed, const void *bytes, size_t size, struct error *err)
+static int write_bytes(void *context, const void *bytes, size_t size, struct error *err)
 {
-	seal_maker_add(&sealed->seal, bytes, size);
-	return durable_write(&sealed->file, bytes, size, err);
-}
+	const char *from = bytes;
+	size_t piece;
+	int code = 0;
 
-static int write_end(struct sealed_file *sealed, struct error *err)
-{
-	size_t size = seal_bytes(sealed->seal.at);
-	char *end = malloc(size);
-	int code = end == NULL ? error_set(err, ERR_NO_MEMORY, "no memory for checksums") : 0;
+	for (size_t at = 0; at < size && code == 0; at += piece) {
+		void *place;
 
-	if (code == 0) {
-		seal_write(sealed->seal.blocks, sealed->seal.at, end);
-		code = durable_write(&sealed->file, end, size, err);
+		piece = size - at < PIECE_BYTES ? size - at : PIECE_BYTES;
+		code = saver_piece(context, piece, &place, err);
+		if (code == 0) {
+			memcpy(place, from + at, piece);
+			saver_give(context, piece);
+		}
 	}
-	free(end);
 	return code;
 }
 
@@ -140,33 +135,27 @@ static int slices_of_a_piece(const struct grid *grid, size_t *ret_slice)
 	return slices < grid->size[2] ? slices : grid->size[2];
 }
 
-/* The iterate behind what the file holds already, piece by piece. */
-static int write_iterate(struct recon *recon, struct sealed_file *sealed, struct error *err)
+/* The iterate behind what the file holds already, piece by piece, straight into it. */
+static int write_iterate(struct recon *recon, struct saver *saver, struct error *err)
 {
 	const struct grid *grid = recon_grid(recon);
 	size_t slice;
 	int slices = slices_of_a_piece(grid, &slice), code = 0;
-	float *voxels = malloc((size_t)slices * slice);
 
-	if (voxels == NULL)
-		return error_set(err, ERR_NO_MEMORY, "no memory for %d slices of %zu bytes", slices, slice);
 	for (int z = 0; z < grid->size[2] && code == 0; z += slices) {
 		int count = z + slices <= grid->size[2] ? slices : grid->size[2] - z;
+		void *place;
 
-		code = recon_read(recon, z, count, voxels, err);
+		code = saver_piece(saver, (size_t)count * slice, &place, err);
 		if (code == 0)
-			code = write_sealed(sealed, voxels, (size_t)count * slice, err);
+			code = recon_read(recon, z, count, place, err);
+		if (code == 0)
+			saver_give(saver, (size_t)count * slice);
 	}
-	free(voxels);
 	return code;
 }
 
-static int write_state(void *context, const void *bytes, size_t size, struct error *err)
-{
-	return write_sealed(context, bytes, size, err);
-}
-
-static int write_history(const struct history *history, struct sealed_file *sealed, struct error *err)
+static int write_history(const struct history *history, struct saver *saver, struct error *err)
 {
 	int code = 0;
 
@@ -174,64 +163,62 @@ static int write_history(const struct history *history, struct sealed_file *seal
 		double numbers[ROW_NUMBERS];
 
 		row_pack(&history->rows[i], numbers);
-		code = write_sealed(sealed, numbers, sizeof(numbers), err);
+		code = write_bytes(saver, numbers, sizeof(numbers), err);
 	}
 	return code;
 }
 
-static int write_checkpoint(struct recon *recon, const struct history *history, struct sealed_file *sealed,
-			    struct error *err)
-{
-	char header[CHECKPOINT_FILE_OFFSET];
-	size_t metal_bytes;
-	const void *metal = recon_found(recon, &metal_bytes);
-	const struct volume_noise *noise = recon_noise(recon), none = {0};
-	const struct checkpoint_sink sink = {.context = sealed, .write = write_state};
-	int code;
-
-	checkpoint_line(header, recon_iteration(recon), recon_grid(recon), recon_state_bytes(recon), metal_bytes,
-			history->count, noise != NULL ? noise : &none);
-	code = write_sealed(sealed, header, sizeof(header), err);
-	if (code == 0)
-		code = write_iterate(recon, sealed, err);
-	if (code == 0)
-		code = recon_save_state(recon, &sink, err);
-	if (code == 0 && metal_bytes > 0)
-		code = write_sealed(sealed, metal, metal_bytes, err);
-	if (code == 0)
-		code = write_history(history, sealed, err);
-	return code != 0 ? code : write_end(sealed, err);
-}
-
-static size_t content_bytes(const struct recon *recon, const struct history *history)
+/* Of a checkpoint with that many rows. */
+static size_t content_bytes(const struct recon *recon, int rows)
 {
 	size_t found;
 
 	recon_found(recon, &found);
 	return CHECKPOINT_FILE_OFFSET + grid_voxels(recon_grid(recon)) * sizeof(float) + recon_state_bytes(recon) +
-	       found + (size_t)history->count * ROW_BYTES;
+	       found + (size_t)rows * ROW_BYTES;
 }
 
-/* The whole file, under its name beside `path`; nothing is left of it when that fails. `path` is borrowed. */
-static int write_beside(struct recon *recon, const struct history *history, const char *path, struct durable *ret_file,
-			struct error *err)
+/* All that is behind the line. */
+static int write_content(struct recon *recon, const struct history *history, struct saver *saver, struct error *err)
 {
-	const size_t content = content_bytes(recon, history);
-	struct sealed_file sealed = {.seal = {0}};
+	const struct checkpoint_sink sink = {.context = saver, .write = write_bytes};
+	size_t metal_bytes;
+	const void *metal = recon_found(recon, &metal_bytes);
+	int code = write_iterate(recon, saver, err);
+
+	if (code == 0)
+		code = recon_save_state(recon, &sink, err);
+	if (code == 0 && metal_bytes > 0)
+		code = write_bytes(saver, metal, metal_bytes, err);
+	return code == 0 ? write_history(history, saver, err) : code;
+}
+
+/*
+ * The whole file, under its name and on its way to the disk; nothing is left of it when that fails. The checkpoint
+ * that had the name is `before` from then on, since the new one may not survive a power cut yet.
+ */
+static int write_checkpoint(struct recon *recon, const struct history *history, struct saver *saver, const char *path,
+			    const char *before, struct error *err)
+{
+	const struct volume_noise *noise = recon_noise(recon), none = {0};
+	char line[CHECKPOINT_FILE_OFFSET];
+	size_t metal_bytes;
 	int code;
 
-	code = seal_maker_new(content, &sealed.seal, err);
-	if (code == 0)
-		code = durable_open(&sealed.file, path, content + seal_bytes(content), err);
-	if (code == 0) {
-		code = write_checkpoint(recon, history, &sealed, err);
-		if (code != 0)
-			durable_abandon(&sealed.file);
+	recon_found(recon, &metal_bytes);
+	checkpoint_line(line, recon_iteration(recon), recon_grid(recon), recon_state_bytes(recon), metal_bytes,
+			history->count, noise != NULL ? noise : &none);
+	code = saver_begin(saver, path, line, sizeof(line), content_bytes(recon, history->count) - sizeof(line), err);
+	if (code != 0)
+		return code;
+	code = write_content(recon, history, saver, err);
+	if (code == 0 && rename(path, before) != 0 && errno != ENOENT)
+		code = error_set_errno(err, errno, "%s cannot be renamed", path);
+	if (code != 0) {
+		saver_abandon(saver);
+		return code;
 	}
-	seal_maker_clear(&sealed.seal);
-	if (code == 0)
-		*ret_file = sealed.file;
-	return code;
+	return saver_end(saver, err);
 }
 
 static int path_of(const char *directory, const char *name, char ret_path[PATH_MAX], struct error *err)
@@ -254,15 +241,19 @@ void checkpoint_remove(const char *directory)
 int checkpoint_save(struct recon *recon, const struct history *history, const char *directory, struct error *err)
 {
 	char path[PATH_MAX], before[PATH_MAX];
-	struct durable file;
+	struct saver *saver = NULL;
+	bool done;
 	int code = path_of(directory, CHECKPOINT_FILE, path, err);
 
 	if (code == 0)
 		code = path_of(directory, CHECKPOINT_FILE_BEFORE, before, err);
 	if (code == 0)
-		code = write_beside(recon, history, path, &file, err);
+		code = saver_new(true, &saver, err);
 	if (code == 0)
-		code = durable_commit(&file, err);
+		code = write_checkpoint(recon, history, saver, path, before, err);
+	if (code == 0)
+		code = saver_finish(saver, true, &done, err);
+	saver_free(saver);
 	if (code == 0)
 		unlink(before);
 	return code;
@@ -271,18 +262,15 @@ int checkpoint_save(struct recon *recon, const struct history *history, const ch
 /* ---- while the run goes on ---- */
 
 struct checkpointer {
-	char path[PATH_MAX], before[PATH_MAX];
+	char path[PATH_MAX], before[PATH_MAX], blank[PATH_MAX];
 	double seconds, due; /* the latter by clock_monotonic */
-	/* The thread that syncs, from checkpointer_begin until checkpointer_settled has joined it. */
-	pthread_t thread;
-	bool busy;
-	atomic_bool done; /* the thread has written result, and ends */
-	struct durable file;
-	int iteration;
-	struct error result;
+	bool ahead;          /* the next file is prepared while the device computes */
+	bool prepared;       /* it is, with its room on the disk, or that was tried */
+	struct saver *saver;
+	int iteration; /* of the checkpoint on its way */
 };
 
-int checkpointer_new(const char *directory, double seconds, struct checkpointer **ret, struct error *err)
+int checkpointer_new(const char *directory, double seconds, bool ahead, struct checkpointer **ret, struct error *err)
 {
 	struct checkpointer *checkpointer = calloc(1, sizeof(*checkpointer));
 	int code = checkpointer == NULL ? error_set(err, ERR_NO_MEMORY, "no memory for checkpoints") : 0;
@@ -291,11 +279,16 @@ int checkpointer_new(const char *directory, double seconds, struct checkpointer 
 		code = path_of(directory, CHECKPOINT_FILE, checkpointer->path, err);
 	if (code == 0)
 		code = path_of(directory, CHECKPOINT_FILE_BEFORE, checkpointer->before, err);
+	if (code == 0)
+		code = path_of(directory, "checkpoint-blank", checkpointer->blank, err);
+	if (code == 0)
+		code = saver_new(true, &checkpointer->saver, err);
 	if (code != 0) {
 		free(checkpointer);
 		return code;
 	}
 	checkpointer->seconds = seconds;
+	checkpointer->ahead = ahead;
 	checkpointer->due = clock_monotonic() + seconds;
 	*ret = checkpointer;
 	return 0;
@@ -305,31 +298,13 @@ void checkpointer_free(struct checkpointer *checkpointer)
 {
 	if (checkpointer == NULL)
 		return;
-	if (checkpointer->busy)
-		pthread_join(checkpointer->thread, NULL);
+	saver_free(checkpointer->saver);
 	free(checkpointer);
 }
 
 bool checkpointer_due(const struct checkpointer *checkpointer)
 {
-	return !checkpointer->busy && clock_monotonic() >= checkpointer->due;
-}
-
-/* The checkpoint before gets its second name before the file that takes its first name is synced. */
-static void *sync_and_name(void *context)
-{
-	struct checkpointer *checkpointer = context;
-	struct error *result = &checkpointer->result;
-
-	result->code = 0;
-	if (rename(checkpointer->path, checkpointer->before) != 0 && errno != ENOENT) {
-		error_set_errno(result, errno, "%s cannot be renamed", checkpointer->path);
-		durable_abandon(&checkpointer->file);
-	} else {
-		durable_commit(&checkpointer->file, result);
-	}
-	atomic_store(&checkpointer->done, true);
-	return NULL;
+	return !saver_busy(checkpointer->saver) && clock_monotonic() >= checkpointer->due;
 }
 
 /* Beside the checkpoint, the disk must keep room for a volume of the job, and for the daemon's records. */
@@ -343,47 +318,51 @@ static bool has_room(const char *path, size_t bytes)
 	return statvfs(directory, &disk) != 0 || (double)disk.f_bavail * (double)disk.f_frsize >= 2 * (double)bytes;
 }
 
+void checkpointer_prepare(struct checkpointer *checkpointer, const struct recon *recon, const struct history *history)
+{
+	const size_t content = content_bytes(recon, history->count + ROWS_AHEAD);
+
+	if (!checkpointer->ahead || checkpointer->prepared || saver_busy(checkpointer->saver) ||
+	    clock_monotonic() < checkpointer->due - SECONDS_AHEAD || !has_room(checkpointer->path, content))
+		return;
+	checkpointer->prepared = true;
+	saver_prepare(checkpointer->saver, checkpointer->blank, content);
+}
+
 int checkpointer_begin(struct checkpointer *checkpointer, struct recon *recon, const struct history *history,
 		       struct error *err)
 {
 	const double begin = clock_monotonic();
+	const bool room = checkpointer->prepared || has_room(checkpointer->path, content_bytes(recon, history->count));
 	struct error why;
-	int code = ERR_NO_SPACE, result;
+	int code = ERR_NO_SPACE;
 
-	if (has_room(checkpointer->path, content_bytes(recon, history)))
-		code = write_beside(recon, history, checkpointer->path, &checkpointer->file, &why);
+	if (room)
+		code = write_checkpoint(recon, history, checkpointer->saver, checkpointer->path, checkpointer->before,
+					&why);
+	checkpointer->prepared = false;
 	checkpointer->due = clock_monotonic() + fmax(checkpointer->seconds, SHARE * (clock_monotonic() - begin));
-	if (code == ERR_NO_SPACE)
-		return 0;
-	if (code != 0) {
-		*err = why;
-		return code;
-	}
 	checkpointer->iteration = recon_iteration(recon);
-	atomic_store(&checkpointer->done, false);
-	result = pthread_create(&checkpointer->thread, NULL, sync_and_name, checkpointer);
-	checkpointer->busy = result == 0;
-	if (result == 0)
-		return 0;
-	durable_abandon(&checkpointer->file);
-	return error_set_errno(err, result, "thread for checkpoints");
+	if (code != 0 && code != ERR_NO_SPACE)
+		*err = why;
+	return code == ERR_NO_SPACE ? 0 : code;
 }
 
 int checkpointer_settled(struct checkpointer *checkpointer, bool wait, int *ret_iteration, struct error *err)
 {
+	struct error why;
+	bool done;
+	int code;
+
 	*ret_iteration = 0;
-	if (!checkpointer->busy || (!wait && !atomic_load(&checkpointer->done)))
+	if (!saver_busy(checkpointer->saver))
 		return 0;
-	pthread_join(checkpointer->thread, NULL);
-	checkpointer->busy = false;
-	if (checkpointer->result.code == ERR_NO_SPACE)
-		return 0;
-	if (checkpointer->result.code != 0) {
-		*err = checkpointer->result;
-		return err->code;
-	}
-	*ret_iteration = checkpointer->iteration;
-	return 0;
+	code = saver_finish(checkpointer->saver, wait, &done, &why);
+	if (code == 0 && done)
+		*ret_iteration = checkpointer->iteration;
+	if (code != 0 && code != ERR_NO_SPACE)
+		*err = why;
+	return code == ERR_NO_SPACE ? 0 : code;
 }
 
 /* ---- reading ---- */

@@ -51,18 +51,23 @@ int checkpoint_resume(struct recon *recon, const char *path, const struct checkp
 		      struct history *history, struct error *ret_damage, struct error *err);
 
 /*
- * Checkpoints of a run that goes on. The iterate is copied into a file's pages by the caller's thread and
- * synced by another, so that no memory is held and the iterations wait for the copy alone. One thread calls.
+ * Checkpoints of a run that goes on. The caller's thread copies the iterate into a file's pages, which another one
+ * sends to the disk (saver.h), so that no memory is held and the iterations wait for the copy alone. One thread calls.
  */
 struct checkpointer;
-/* seconds: of work between two checkpoints. */
-int checkpointer_new(const char *directory, double seconds, struct checkpointer **ret, struct error *err);
+/* seconds: of work between two checkpoints. ahead: files are prepared while a device computes. */
+int checkpointer_new(const char *directory, double seconds, bool ahead, struct checkpointer **ret, struct error *err);
 void checkpointer_free(struct checkpointer *checkpointer); /* waits for the disk; NULL is fine */
 /*
  * Whether the next checkpoint is due: so many seconds of work after the last, or later where the copies
  * would take more than a fiftieth of the time, and the last one is on the disk.
  */
 bool checkpointer_due(const struct checkpointer *checkpointer);
+/*
+ * Gets the next file's pages beside the work that goes on, where that is asked for and the checkpoint is due in a
+ * second or less. For each iteration that leaves none; a hint.
+ */
+void checkpointer_prepare(struct checkpointer *checkpointer, const struct recon *recon, const struct history *history);
 /*
  * Begins a checkpoint of the iterate as it is. A disk without room for it, and for a volume of the job beside it, is no
  * error: there is none then.

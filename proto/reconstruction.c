@@ -115,8 +115,12 @@ static int keep_checkpoint(struct run *run, struct error *err)
 {
 	int code = announce_checkpoint(run, false, err);
 
-	if (code != 0 || !checkpointer_due(run->checkpointer))
+	if (code != 0)
 		return code;
+	if (!checkpointer_due(run->checkpointer)) {
+		checkpointer_prepare(run->checkpointer, run->recon, &run->history);
+		return 0;
+	}
 	code = settle(run, false, err);
 	if (code != 0 || (run->saver != NULL && saver_busy(run->saver)))
 		return code;
@@ -1122,7 +1126,7 @@ int reconstruction_open(const struct backend *backend, struct device *device,
 	if (code == 0 && options->checkpoint_seconds > 0 && options->checkpoint == NULL)
 		checkpoint_remove(options->out_directory);
 	if (code == 0 && options->checkpoint_seconds > 0)
-		code = checkpointer_new(options->out_directory, options->checkpoint_seconds,
+		code = checkpointer_new(options->out_directory, options->checkpoint_seconds, backend->own_memory,
 					&reconstruction->run.checkpointer, err);
 	if (code == 0)
 		code = open_first(reconstruction, err);

@@ -31,7 +31,8 @@ enum {
 struct mapped {
 	struct durable file;
 	char *bytes; /* NULL: there is none */
-	size_t size, populated;
+	size_t size; /* of the mapping; the file may end up to a piece before */
+	size_t populated;
 };
 
 struct saver {
@@ -333,10 +334,19 @@ bool saver_busy(const struct saver *saver)
 	return saver->busy;
 }
 
+/* The file's end is cut off where it is a little longer than it has to be; nobody comes to the pages behind it. */
+static bool blank_serves(const struct saver *saver, size_t size)
+{
+	const struct mapped *blank = &saver->blank;
+
+	return blank->bytes != NULL && blank->size >= size && blank->size - size <= PIECE_BYTES &&
+	       (blank->size == size || ftruncate(blank->file.file, (off_t)size) == 0);
+}
+
 static int take_file(struct saver *saver, size_t size, struct error *err)
 {
 	stop_preparing(saver);
-	if (saver->blank.bytes == NULL || saver->blank.size != size) {
+	if (!blank_serves(saver, size)) {
 		drop_blank(saver); /* of no use, and its space may be needed */
 		return map_new(&saver->file, saver->path, size, err);
 	}

@@ -23,7 +23,7 @@ void saver_abandon(struct saver *saver);
 void saver_free(struct saver *saver);
 
 /*
- * A file of `content` bytes for the saver_begin to come, PATH.tmp until then: set
+ * A file of `content` bytes, or up to 4 MiB less, for the saver_begin to come, PATH.tmp until then: set
  * aside, mapped, and its pages got ready by threads of their own, since a page's
  * first use costs more than filling it. To be called when it is known that
  * another file comes soon, again when that took long. A hint: what fails here is

@@ -428,6 +428,13 @@ START_TEST(a_prepared_file_becomes_the_next_one_of_its_size)
 	ck_assert_int_eq(save(saver, &err), 0);
 	assert_saved();
 	settle(saver);
+	/* One that is a little longer is cut off. */
+	saver_prepare(saver, blank, HEADER + VOXELS + 100000);
+	inode = inode_of(blank_beside);
+	ck_assert_int_eq(save(saver, &err), 0);
+	ck_assert_uint_eq(inode_of(path), inode);
+	settle(saver);
+	assert_saved();
 	/* One of another size is of no use, one that nobody uses goes. */
 	saver_prepare(saver, blank, VOXELS);
 	ck_assert_int_eq(save(saver, &err), 0);
@@ -614,8 +621,10 @@ END_TEST
 enum { KEPT_MOST = 16 };
 
 struct watched {
-	int yield_at, cancel_at; /* after this row; 0: never */
-	int fail_at;             /* the n-th volume is refused */
+	int yield_at, cancel_at;                /* after this row; 0: never */
+	int fail_at;                            /* the n-th volume is refused */
+	double checkpoint_seconds, row_seconds; /* between checkpoints; that each row takes longer */
+	int checkpoints, checkpoint;            /* how many, the iteration of the last one */
 	int rows, last_row, kept, opened;
 	struct saved_volume saved[KEPT_MOST];
 	uint8_t sha256[KEPT_MOST][32]; /* of the voxels in the files, as they are when settled */
@@ -645,6 +654,17 @@ static void watched_row(void *context, const struct history_row *row)
 
 	watched->rows++;
 	watched->last_row = row->iteration;
+	usleep((useconds_t)(1e6 * watched->row_seconds));
+}
+
+static int watched_checkpoint(void *context, int iteration, struct error *err)
+{
+	struct watched *watched = context;
+
+	(void)err;
+	watched->checkpoints++;
+	watched->checkpoint = iteration;
+	return 0;
 }
 
 static void watched_warning(void *context, const char *code, const char *detail)
@@ -719,12 +739,14 @@ static int run(const char *request_text, const char *where, const char *checkpoi
 							     .warning = watched_warning},
 						   .on_volume = watched_volume,
 						   .on_settled = watched_settled,
+						   .on_checkpoint = watched_checkpoint,
 						   .on_open = watched_open};
 	const struct device_options options = {.threads = 2};
 	struct reconstruction_options what = {.scan_directory = directory,
 					      .out_directory = where,
 					      .checkpoint = checkpoint,
 					      .iteration = iteration,
+					      .checkpoint_seconds = watched->checkpoint_seconds,
 					      .hooks = &hooks};
 	struct job_request request;
 	struct device *device = NULL;
@@ -1007,6 +1029,49 @@ START_TEST(a_run_that_yields_goes_on_to_the_same_bits)
 }
 END_TEST
 
+/*
+ * Checkpoints of a run that goes on, with files got ready while a device computes and without. The first is due behind
+ * the second row; the run's end comes before the next is.
+ */
+static void assert_kept_beside(bool own_memory)
+{
+	struct watched whole = {0}, kept = {.checkpoint_seconds = .3, .row_seconds = .2}, rest = {0};
+	struct error err = {0};
+	char straight[160], checkpoint[200];
+
+	put_scan();
+	backend.own_memory = own_memory;
+	snprintf(straight, sizeof(straight), "%s/straight", directory);
+	snprintf(checkpoint, sizeof(checkpoint), "%s/%s", out, CHECKPOINT_FILE);
+	ck_assert_int_eq(mkdir(straight, 0700), 0);
+	ck_assert_int_eq(run(pipeline, straight, NULL, 0, &whole, &err), 0);
+	ck_assert_msg(run(pipeline, out, NULL, 0, &kept, &err) == 0, "%s", err.text);
+	ck_assert_int_ge(kept.checkpoints, 1);
+	ck_assert(is_there(out, CHECKPOINT_FILE));
+	/* The volumes, one or two checkpoints, and nothing that was got ready and not used. */
+	ck_assert_int_eq(count_files(out), 5 + (kept.checkpoints > 1 ? 2 : 1));
+	ck_assert_msg(run(pipeline, out, checkpoint, kept.checkpoint, &rest, &err) == 0, "%s", err.text);
+	ck_assert_int_eq(rest.rows, 4 - kept.checkpoint);
+	for (int i = 0; i < whole.kept; i++) {
+		char name[64];
+
+		snprintf(name, sizeof(name), "%s.nii", whole.names[i]);
+		assert_same_file(straight, out, name);
+	}
+}
+
+START_TEST(a_run_keeps_checkpoints_while_it_goes_on)
+{
+	assert_kept_beside(false);
+}
+END_TEST
+
+START_TEST(a_run_on_a_device_of_its_own_memory_has_its_checkpoints_prepared)
+{
+	assert_kept_beside(true);
+}
+END_TEST
+
 static void assert_goes_on(const struct phantom *phantom, const char *warning)
 {
 	static const char request[] = "{\"scan\":\"s\",\"grid\":{\"size\":[24,20,12],\"spacing_mm\":[4,5,6]},"
@@ -1189,6 +1254,8 @@ Suite *scan_directory_suite(void)
 	tcase_add_test(pipelines, projections_that_make_no_sense_are_refused);
 	tcase_add_test(pipelines, a_scan_of_what_is_there_is_as_if_no_more_had_been_planned);
 	tcase_add_test(pipelines, a_run_that_yields_goes_on_to_the_same_bits);
+	tcase_add_test(pipelines, a_run_keeps_checkpoints_while_it_goes_on);
+	tcase_add_test(pipelines, a_run_on_a_device_of_its_own_memory_has_its_checkpoints_prepared);
 	tcase_add_test(pipelines, a_body_wider_than_the_detector_goes_on_from_its_checkpoint);
 	tcase_add_test(pipelines, a_body_with_a_rod_goes_on_from_its_checkpoint);
 	tcase_add_test(pipelines, a_checkpoint_that_is_newer_brings_its_history_and_serves_where_no_volume_is_missing);
