@@ -62,14 +62,14 @@ class Gone(Exception):
 
 
 class Daemon:
-    def __init__(self, build: str, work: str, every: Optional[str], *options: str) -> None:
+    def __init__(self, build: str, work: str, every: Optional[str], *options: str, backend: str = "cpu") -> None:
         environment = dict(os.environ, OMP_NUM_THREADS="1")
         if every is not None:
             environment.update(LD_PRELOAD=f"{build}/every.so", CBCT_EVERY=every)
         self.out = open(f"{work}/out", "w+b")
         self.err = open(f"{work}/err", "ab")
         self.process = subprocess.Popen(
-            [f"{build}/cbctd", "--listen", "127.0.0.1:0", "--state-dir", f"{work}/state", "--backend", "cpu",
+            [f"{build}/cbctd", "--listen", "127.0.0.1:0", "--state-dir", f"{work}/state", "--backend", backend,
              "--threads", "1", *options], stdout=self.out, stderr=self.err, env=environment)
         self.port = 0
         end = time.monotonic() + PATIENCE

@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Small scans in and out of a daemon, and what it and its worker keep of each: memory, descriptors, threads.
 
-growth.py BUILD WORK [--scans N] [--seconds S]
+growth.py BUILD WORK [--scans N] [--seconds S] [--backend cpu|cuda]
 
 N scans are posted, reconstructed, looked at by most routes and downloaded, spread over S seconds. The newest KEPT stay,
 each older one is deleted with its job, so that the daemon has as much to remember after the N-th as after the KEPT-th.
@@ -10,7 +10,8 @@ exit status 1 where one rises by more than its bound.
 
 The warm-up: WARM scans, since the catalogue keeps the last 1,000 removals of jobs (store/tables.c), and its database
 grows by them until then. A run of fewer than about twice that many scans is judged by
-descriptors and threads, of which not one may come, and by the worker's live bytes.
+descriptors and threads, of which not one may come, by what is in use of a card's memory, which may not rise, and by the
+worker's live bytes.
 
 The bounds. Live bytes (build/live_bytes.so counts them): 16 a scan, since the smallest block that malloc gives has 24,
 so that one block left behind by each scan would be more. Live blocks: one in ten scans. Resident memory: 100 bytes a
@@ -22,6 +23,7 @@ import http.client
 import json
 import os
 import random
+import re
 import shutil
 import struct
 import sys
@@ -45,11 +47,11 @@ WARM = 1000 + 2 * KEPT
 
 
 class Growing(Daemon):
-    def __init__(self, build: str, work: str) -> None:
+    def __init__(self, build: str, work: str, backend: str) -> None:
         self.work = work
         os.environ["CBCT_LIVE_BYTES"] = f"{work}/live"
         os.environ["LD_PRELOAD"] = f"{build}/live_bytes.so"
-        super().__init__(build, work, None)
+        super().__init__(build, work, None, backend=backend)
         del os.environ["LD_PRELOAD"]
         self.connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=60)
 
@@ -79,6 +81,9 @@ class Growing(Daemon):
             row[f"{name}.threads"] = len(os.listdir(f"/proc/{pid}/task"))
             bytes_, blocks = struct.unpack("<2q", open(f"{self.work}/live.{pid}", "rb").read(16))
             row[f"{name}.live_bytes"], row[f"{name}.live_blocks"] = bytes_, blocks
+        cards = re.findall(r"^cbctd_gpu_memory_used_bytes\S* (\S+)$", self.call("GET", "/metrics").decode(), re.M)
+        if cards:
+            row["cards.device_bytes"] = sum(int(float(card)) for card in cards)
         return row
 
 
@@ -126,7 +131,7 @@ def judge(path: str) -> int:
         ys = [float(row[column]) for row in rows]
         rise, error = slope([float(row["scans"]) for row in rows], ys)
         verdict = ""
-        if what in ("descriptors", "threads"):
+        if what in ("descriptors", "threads", "device_bytes"):
             if ys[-1] > max(ys[:max(1, len(ys) // 4)]):
                 verdict = "RISES"
         elif what in BOUNDS and (whole or (program, what) == ("worker", "live_bytes")) and rise > BOUNDS[what]:
@@ -143,11 +148,12 @@ def main() -> int:
     parser.add_argument("work")
     parser.add_argument("--scans", type=int, default=2000)
     parser.add_argument("--seconds", type=float, default=0, help="spread over that")
+    parser.add_argument("--backend", default="cpu")
     options = parser.parse_args()
     shutil.rmtree(options.work, ignore_errors=True)
     os.makedirs(options.work)
     data = struct.pack(f"<{VIEWS * COLUMNS * ROWS}f", *(random.random() for _ in range(VIEWS * COLUMNS * ROWS)))
-    daemon = Growing(options.build, options.work)
+    daemon = Growing(options.build, options.work, options.backend)
     kept: List[Tuple[str, str]] = []
     begin = time.monotonic()
     try:
