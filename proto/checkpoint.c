@@ -302,6 +302,11 @@ void checkpointer_free(struct checkpointer *checkpointer)
 	free(checkpointer);
 }
 
+void checkpointer_discard(struct checkpointer *checkpointer)
+{
+	saver_discard(checkpointer->saver);
+}
+
 bool checkpointer_due(const struct checkpointer *checkpointer)
 {
 	return !saver_busy(checkpointer->saver) && clock_monotonic() >= checkpointer->due;

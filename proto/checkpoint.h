@@ -57,6 +57,8 @@ int checkpoint_resume(struct recon *recon, const char *path, const struct checkp
 struct checkpointer;
 /* seconds: of work between two checkpoints. ahead: files are prepared while a device computes. */
 int checkpointer_new(const char *directory, double seconds, bool ahead, struct checkpointer **ret, struct error *err);
+/* The checkpoint on its way to the disk is not needed any more: nobody waits for it. */
+void checkpointer_discard(struct checkpointer *checkpointer);
 void checkpointer_free(struct checkpointer *checkpointer); /* waits for the disk; NULL is fine */
 /*
  * Whether the next checkpoint is due: so many seconds of work after the last, or later where the copies

@@ -1390,8 +1390,10 @@ int reconstruction_finish(struct reconstruction *reconstruction, struct error *e
 	if (code == 0)
 		code = recon_run(reconstruction->recon, err);
 
-	/* Announced volumes are settled, however the run ends. */
+	/* Announced volumes are settled, however the run ends. Nobody goes on from a run that has come to its end. */
 	disk_steps(run, true);
+	if (run->checkpointer != NULL && (code == 0 || code == ERR_CANCELLED))
+		checkpointer_discard(run->checkpointer);
 	if (run->trouble.code == 0)
 		settle(run, true, &run->trouble);
 	/* A checkpoint on its way would take the place of one that is written now. */

@@ -317,6 +317,12 @@ void saver_abandon(struct saver *saver)
 		drop_file(saver);
 }
 
+void saver_discard(struct saver *saver)
+{
+	if (saver->busy)
+		drop_file(saver);
+}
+
 void saver_free(struct saver *saver)
 {
 	if (saver == NULL)
@@ -438,6 +444,8 @@ int saver_end(struct saver *saver, struct error *err)
 		drop_file(saver);
 		return code;
 	}
+	/* What is dropped from here on goes by that name. */
+	memcpy(saver->file.file.beside, saver->path, sizeof(saver->path));
 	pthread_mutex_lock(&saver->lock);
 	saver->ended = true;
 	pthread_cond_broadcast(&saver->changed);

@@ -19,7 +19,9 @@ struct saver;
 int saver_new(bool sealed, struct saver **ret_saver, struct error *err);
 /* Waits for a file that has its name already; a file without one leaves nothing behind. */
 void saver_abandon(struct saver *saver);
-/* The same first; what was prepared goes too. NULL is fine. */
+/* A file that nobody needs any more goes, its name too, without a wait for the rest of it to reach the disk. */
+void saver_discard(struct saver *saver);
+/* saver_abandon first; what was prepared goes too. NULL is fine. */
 void saver_free(struct saver *saver);
 
 /*

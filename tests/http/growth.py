@@ -81,7 +81,7 @@ class Growing(Daemon):
             row[f"{name}.threads"] = len(os.listdir(f"/proc/{pid}/task"))
             bytes_, blocks = struct.unpack("<2q", open(f"{self.work}/live.{pid}", "rb").read(16))
             row[f"{name}.live_bytes"], row[f"{name}.live_blocks"] = bytes_, blocks
-        cards = re.findall(r"^cbctd_gpu_memory_used_bytes\S* (\S+)$", self.call("GET", "/metrics").decode(), re.M)
+        cards = re.findall(r"^cbctd_gpu_memory_used_bytes.* (\S+)$", self.call("GET", "/metrics").decode(), re.M)
         if cards:
             row["cards.device_bytes"] = sum(int(float(card)) for card in cards)
         return row
