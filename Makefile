@@ -194,7 +194,7 @@ $(BUILD)/cbctd-without-postgresql: $(filter-out $(BUILD)/daemon/store/postgresql
 
 gpu_programs := $(BUILD)/gpu_check $(BUILD)/gpu_bench $(BUILD)/gpu_cards $(BUILD)/gpu_large
 # Every program that a test or a benchmark runs, so that none stops compiling unseen.
-test-programs: $(addprefix $(BUILD)/,unit member cbct-worker-held cbctd-held cbctd-without-postgresql manual faults.so clock.so every.so live_bytes.so simulated-nvml/libnvidia-ml.so.1 cpu-bench calibrate-bench agreement refine denoise presets stopping methods watchers slices acquire paper-project rabbitct $(if $(postgresql),claims)) \
+test-programs: $(addprefix $(BUILD)/,unit member cbct-worker-held cbctd-held cbctd-without-postgresql manual faults.so clock.so every.so live_bytes.so simulated-nvml/libnvidia-ml.so.1 cpu-bench calibrate-bench agreement breathing refine denoise presets stopping methods watchers slices acquire paper-project rabbitct $(if $(postgresql),claims)) \
                $(if $(cuda_objects),$(gpu_programs) $(BUILD)/gpu_ceilings $(BUILD)/cbct-worker-faulty,$(call objects,$(wildcard tests/bench/gpu_*.c)))
 
 # What tests ask of JSON documents by the thousand.
@@ -246,6 +246,10 @@ $(BUILD)/methods: $(call objects,tests/bench/methods.c tests/unit/anatomy.c) $(l
 
 # What the check of the geometry says of scans whose geometry is known.
 $(BUILD)/agreement: $(call objects,tests/bench/agreement.c tests/bench/bodies.c tests/unit/arm.c) $(library)
+	$(call say,LINK)$(CC) $(LDFLAGS) -o $@ $^ $(call pkg,--libs,$(core_libs)) $(LIBM)
+
+# Who is told to have breathed.
+$(BUILD)/breathing: $(call objects,tests/bench/breathing.c tests/bench/bodies.c tests/unit/arm.c) $(library)
 	$(call say,LINK)$(CC) $(LDFLAGS) -o $@ $^ $(call pkg,--libs,$(core_libs)) $(LIBM)
 
 # What the refinement makes of such scans.
@@ -356,6 +360,10 @@ bench-methods: setup ## every method at its best on three anatomies, 26 to 200 v
 bench-agreement: setup ## what the check of the geometry says of known scans, on standard output
 	@$(MAKE) --no-print-directory -j$$(nproc) $(BUILD)/agreement >&2
 	@$(BUILD)/agreement
+
+bench-breathing: setup ## who is told to have breathed, of known scans, on standard output
+	@$(MAKE) --no-print-directory -j$$(nproc) $(BUILD)/breathing >&2
+	@$(BUILD)/breathing
 
 bench-refine: setup ## what the refinement makes of known scans, on standard output
 	@$(MAKE) --no-print-directory -j$$(nproc) $(BUILD)/refine >&2
@@ -519,6 +527,6 @@ clean: ## removes build/
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z_.-]+:.*## /{printf "  make %-21s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
 
-.PHONY: all test-programs for-tests again setup demo check soak fuzz fuzzers paper paper-report bench bench-agreement bench-refine bench-calibrate bench-denoise bench-presets bench-stopping bench-methods check-gpu bench-gpu asan tsan lint format rooms pictures third-party compile_commands.json install deb container sbom reproducible clean help
+.PHONY: all test-programs for-tests again setup demo check soak fuzz fuzzers paper paper-report bench bench-agreement bench-breathing bench-refine bench-calibrate bench-denoise bench-presets bench-stopping bench-methods check-gpu bench-gpu asan tsan lint format rooms pictures third-party compile_commands.json install deb container sbom reproducible clean help
 .SECONDARY:
 -include $(shell find $(BUILD) -path $(BUILD)/test -prune -o -type f -name '*.d' -print 2>/dev/null)

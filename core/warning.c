@@ -48,6 +48,9 @@ const struct warning_kind warning_kinds[] = {
      "The arm turned the other way than the scan says, or the projections are mirrored: left and right are exchanged "
      "in "
      "the image, and shapes are wrong."},
+    {"breathing", SEVERITY_CAUTION,
+     "Something in the patient moved to and fro while the arm turned, as with breathing: what moved is blurred or "
+     "doubled in the image."},
     /* ---- of a calibration, and of a scan that uses one ---- */
     {"calibration_interpolated", SEVERITY_INFO,
      "The arm's places in this scan are interpolated between those that were calibrated."},

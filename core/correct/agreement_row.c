@@ -141,6 +141,24 @@ static void tell(const struct correction_job *job, const struct agreement *agree
 		     100 * agreement->unexplained);
 }
 
+/* An order of the views that is not the true one breaks all up. */
+static void tell_breathing(const struct correction_job *job, const struct agreement *agreement, double bin)
+{
+	const struct breathing *breathing = &agreement->breathing;
+	const struct hill *hill = &breathing->all;
+
+	if (!breathing_is_told(breathing) || opposite_rays_other_way(&agreement->rays) ||
+	    opposite_rays_displaced(&agreement->rays) || agreement_is_aside(agreement, bin))
+		return;
+	if (breathing->uneven.share > hill->share)
+		hill = &breathing->uneven;
+	warning_tell(job->warnings, "breathing",
+		     "what a row of the detector shows comes and goes about %.0f times in the sweep, by %.2g %% (root "
+		     "mean square), %.2g times what is slower and %.2g times the noise there: no object at rest does "
+		     "that, wherever the arm stood",
+		     hill->times_in_sweep, 100 * hill->share, hill->times, hill->share / hill->noise);
+}
+
 static int warn(const struct correction_job *job, void *opaque, struct error *err)
 {
 	struct state *state = opaque;
@@ -158,6 +176,7 @@ static int warn(const struct correction_job *job, void *opaque, struct error *er
 	if (code < 0)
 		return code;
 	tell(job, &agreement, reduced_bin(&state->reduced, job->orbit));
+	tell_breathing(job, &agreement, reduced_bin(&state->reduced, job->orbit));
 	if (agreement_is_known(&agreement)) {
 		job->agreement->mm = agreement.mm;
 		job->agreement->sigma_mm = agreement.sigma_mm;

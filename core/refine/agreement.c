@@ -121,7 +121,8 @@ int agreement_bytes(const struct reduced *reduced, size_t *ret_bytes, struct err
 	if (code == 0)
 		*ret_bytes =
 		    (size_t)geometry->count * (size_t)geometry->columns * (size_t)geometry->rows * sizeof(float) +
-		    bytes.volumes + bytes.scratch + bytes.raw + (2 + HALVES) * backend->volume_bytes(NULL, &half.grid) +
+		    breathing_bytes(reduced) + bytes.volumes + bytes.scratch + bytes.raw +
+		    (2 + HALVES) * backend->volume_bytes(NULL, &half.grid) +
 		    fdk_bytes(backend, NULL, geometry, half.weights.pad) +
 		    backend->stack_bytes(NULL, geometry->columns, geometry->rows, geometry->count) +
 		    backend->stack_bytes(NULL, geometry->columns, geometry->rows, half_of(geometry->count));
@@ -375,7 +376,7 @@ static bool is_cut(const struct reduced *reduced)
 }
 
 /* Holds the views against what the others make of them; views, made: work. */
-static int compare_with_volume(struct half *half, int *views, float *made, struct view_agreement *ret_views,
+static int compare_with_volume(struct half *half, int *views, float *made, struct agreement *agreement,
 			       struct error *err)
 {
 	const struct reduced *reduced = half->reduced;
@@ -385,7 +386,9 @@ static int compare_with_volume(struct half *half, int *views, float *made, struc
 		code = backend_cpu.stack_upload(half->measured, 0, reduced->geometry.count, reduced->projections, err);
 	if (code == 0)
 		code = predict(half, views, made, err);
-	return code == 0 ? compare_views(half, made, ret_views, err) : code;
+	if (code == 0)
+		code = compare_views(half, made, agreement->views, err);
+	return code == 0 ? breathing_measure(reduced, made, !half->orbit.short_scan, &agreement->breathing, err) : code;
 }
 
 int agreement_measure(const struct reduced *reduced, const struct cancel *cancel, struct agreement *ret_agreement,
@@ -403,7 +406,7 @@ int agreement_measure(const struct reduced *reduced, const struct cancel *cancel
 		code = error_set(err, ERR_NO_MEMORY, "no memory for %d views in bins", geometry->count);
 	half.cancel = cancel;
 	if (code == 0 && geometry->count >= WHOLE_LEAST)
-		code = compare_with_volume(&half, views, made, agreement.views, err);
+		code = compare_with_volume(&half, views, made, &agreement, err);
 	if (code == 0)
 		code = compare_opposite(reduced, &half.orbit, &agreement, err);
 	if (code == 0) {

@@ -2,6 +2,7 @@
 #define CBCT_CORE_AGREEMENT_H
 
 #include "core/backend.h"
+#include "core/refine/breathing.h"
 #include "core/refine/opposite.h"
 #include "core/refine/reduced.h"
 
@@ -58,6 +59,7 @@ struct agreement {
 	bool short_scan; /* of the orbit; both raise what is told of a geometry that lies aside */
 	bool displaced;  /* the detector: half of the views see each outer ray */
 	struct opposite_rays rays;
+	struct breathing breathing;   /* by what the others make of each view */
 	struct view_agreement *views; /* [reduced.geometry.count], owned */
 };
 

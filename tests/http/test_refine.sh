@@ -251,5 +251,39 @@ test_few_noisy_views_are_refined_with_the_volume_of_another_job() {
 	expect_status 204
 }
 
+# A ball goes up and down by 12 mm nine times in the sweep within what rests, as a diaphragm does: nothing rigid mends that.
+test_what_breathes_is_told_and_no_motion_mends_it() {
+	local at sweep=(--density 0.02 --views 96 --arc 210 --columns 48 --rows 40 --pixel 8)
+	cbct simulate --phantom asymmetric --scale 90 "${sweep[@]}" -o "$work/rests" >/dev/null || fail "cbct simulate"
+	for at in 0 3 6 9 12; do
+		cbct simulate --phantom ball --scale 30 --shift "15,5,$at" "${sweep[@]}" -o "$work/ball-$at" >/dev/null || fail "cbct simulate"
+	done
+	cp -r "$work/rests" "$work/breathes"
+	/usr/bin/python3 - "$work" <<-'END' || fail "the ball's projections in turn, added to the others"
+		import array, math, sys
+		work = sys.argv[1]
+		def read(name):
+		    values = array.array("f")
+		    with open(f"{work}/{name}/projections.raw", "rb") as file:
+		        values.frombytes(file.read())
+		    return values
+		balls = [read(f"ball-{at}") for at in (0, 3, 6, 9, 12)]
+		for name, depth in (("rests", 0), ("breathes", 4)):
+		    all = read(name)
+		    for i in range(len(all)):
+		        view = i // (48 * 40)
+		        all[i] += balls[round(depth * math.cos(math.pi * 9 * view / 96) ** 4)][i]
+		    with open(f"{work}/{name}/projections.raw", "wb") as file:
+		        all.tofile(file)
+	END
+	reconstruct "$work/rests" "$recipe"'"fdk": {}}'
+	expect_json '.warnings | all(.code != "breathing")'
+	reconstruct "$work/breathes" "$recipe"'"fdk": {}}'
+	expect_json '[.warnings[] | select(.code == "breathing" and .severity == "caution" and (.detail | test("about 9 times")))] | length == 1'
+	post_job "$recipe"'"fdk": {}, "refine": {"motion": true}}'
+	wait_job succeeded
+	expect_json '[.warnings[] | select(.code == "breathing")] | length == 1'
+}
+
 start_daemon --checkpoint-seconds 3600
 run_tests
