@@ -2,9 +2,11 @@
  * Several cards in one job beside one of them (core/cards/cards.h): results first, on small scenes of every kind, then
  * times of cases D and E as in gpu_bench.c. Prints one line each; ends with 1 if a result is off.
  *
- *   gpu_cards [--brief] [--apart] [CARDS ...]   default: 2 and 4, as far as they are there; --brief, for
- *                                       compute-sanitizer: results of three bends, and no times; --apart: the cards
- *                                       pass everything through the host
+ *   gpu_cards [--brief | --shares] [--apart] [CARDS ...]   default: 2 and 4, as far as they are there; --brief, for
+ *                                       compute-sanitizer: results of three bends, and no times; --shares: times of
+ *                                       cases A and B, too, and what one card takes with its share of the views and the
+ *                                       whole volume, as it would if views were divided; --apart: the cards pass
+ *                                       everything through the host
  */
 #include <math.h>
 #include <stdio.h>
@@ -343,8 +345,48 @@ static void time_case(char letter, const struct scene_options *options, const in
 	scene_clear(&scene);
 }
 
+/* One card with each number's share of the views: the other division without what it would exchange. */
+static void time_shares(char letter, const struct scene_options *options, const int *cards, int cards_count)
+{
+	for (int i = 0; i < cards_count; i++) {
+		struct scene_options share = *options;
+		struct scene scene;
+		struct bench bench;
+
+		share.views /= cards[i];
+		scene_make(&scene, "turned", &share);
+		begin(&bench, &scene, 1);
+		for (int row = 0; row < ROWS; row++) {
+			if (rows[row].subsets == 0 || rows[row].matched || (letter == 'E' && rows[row].subsets > 1))
+				continue;
+			begin_row(&bench, row);
+			printf("%c 1 card, %d of %d views, %-24s %10.2f ms\n", letter, share.views, options->views,
+			       rows[row].what, milliseconds_of(&bench, rows[row].run));
+			fflush(stdout);
+		}
+		end(&bench);
+		scene_clear(&scene);
+	}
+}
+
 int main(int argc, char **argv)
 {
+	const struct scene_options a = {.columns = 559,
+					.rows = 559,
+					.views = 100,
+					.arc = 2 * M_PI,
+					.pixel = {.529, .529},
+					.size = {256, 256, 256},
+					.spacing = {.3725, .3725, .3725},
+					.bend = BEND_TURNED};
+	const struct scene_options b = {.columns = 339,
+					.rows = 339,
+					.views = 100,
+					.arc = 2 * M_PI,
+					.pixel = {.713, .713},
+					.size = {256, 256, 33},
+					.spacing = {.3725, .3725, .3725},
+					.bend = BEND_TURNED};
 	const struct scene_options d = {.columns = 1240,
 					.rows = 960,
 					.views = 496,
@@ -362,10 +404,11 @@ int main(int argc, char **argv)
 					.spacing = {.0931, .0931, .0931},
 					.bend = BEND_TURNED};
 	const bool brief = argc > 1 && strcmp(argv[1], "--brief") == 0;
-	int cards[CARDS_MOST], count = 0;
+	const bool shares = argc > 1 && strcmp(argv[1], "--shares") == 0;
+	int cards[CARDS_MOST], count = 0, at = 1 + (brief || shares);
 
-	apart = argc > 1 + brief && strcmp(argv[1 + brief], "--apart") == 0;
-	for (int i = 1 + brief + apart; i < argc && count < CARDS_MOST; i++)
+	apart = argc > at && strcmp(argv[at], "--apart") == 0;
+	for (int i = at + apart; i < argc && count < CARDS_MOST; i++)
 		cards[count++] = atoi(argv[i]);
 	if (count == 0)
 		for (int n = 2; n <= 4 && n <= backend_cuda.count(); n += 2)
@@ -379,5 +422,13 @@ int main(int argc, char **argv)
 		return failures > 0;
 	time_case('D', &d, cards, count);
 	time_case('E', &e, cards, count);
+	if (!shares)
+		return failures > 0;
+	time_case('A', &a, cards, count);
+	time_case('B', &b, cards, count);
+	time_shares('A', &a, cards, count);
+	time_shares('B', &b, cards, count);
+	time_shares('D', &d, cards, count);
+	time_shares('E', &e, cards, count);
 	return failures > 0;
 }
