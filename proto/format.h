@@ -18,7 +18,7 @@ extern const char *const volume_type_names[VOLUME_TYPE_COUNT]; /* "float32", "in
 extern const char *const volume_units[VOLUME_TYPE_COUNT];      /* "1/mm", "HU" */
 
 /* The longest header that is written; FORMAT_REVISION grows with each change of what is written for one volume. */
-enum { FORMAT_HEADER_MAX = 16384, FORMAT_REVISION = 4 };
+enum { FORMAT_HEADER_MAX = 16384, FORMAT_REVISION = 5 };
 
 struct volume_format {
 	const char *name;       /* "nifti", "nifti.gz", "mha", "raw": the value of ?format= */

@@ -85,6 +85,16 @@ int zencoder_new(int level, int workers, struct zencoder **ret_encoder, struct e
 	return 0;
 }
 
+int zencoder_look_near(struct zencoder *encoder, struct error *err)
+{
+	enum { WINDOW_LOG = 17 /* 128 KiB: a block, the least that costs nothing */, HASH_LOG = 12 /* 16 KiB */ };
+
+	if (ZSTD_isError(ZSTD_CCtx_setParameter(encoder->context, ZSTD_c_windowLog, WINDOW_LOG)) ||
+	    ZSTD_isError(ZSTD_CCtx_setParameter(encoder->context, ZSTD_c_hashLog, HASH_LOG)))
+		return error_set(err, ERR_INTERNAL, "zstd encoder: its window cannot be set");
+	return 0;
+}
+
 void zencoder_free(struct zencoder *encoder)
 {
 	if (encoder == NULL)

@@ -27,6 +27,8 @@ int gzip_encoder_new(int level, struct zencoder **ret_encoder, struct error *err
  * frame depends on there being any, not on how many.
  */
 int zencoder_new(int level, int workers, struct zencoder **ret_encoder, struct error *err);
+/* Before the first step, of zstd: looks for repetitions only as far back as the nearest caches hold. */
+int zencoder_look_near(struct zencoder *encoder, struct error *err);
 void zencoder_free(struct zencoder *encoder);
 /* last: no input after this; call until *ret_ended. */
 int zencoder_step(struct zencoder *encoder, const void *in, size_t in_size, size_t *ret_consumed, bool last, void *out,
