@@ -6,10 +6,12 @@
 
 #include "core/correct/counts.h"
 #include "core/correct/input.h"
+#include "core/correct/metal.h"
 
 extern const struct correction correction_lag, correction_scatter, correction_flat_dark, correction_air_region,
     correction_hardening, correction_defects, correction_samples, correction_truncation, correction_exterior,
-    correction_blank_views, correction_metal, correction_dense, correction_averaging, correction_agreement;
+    correction_blank_views, correction_metal, correction_dense, correction_averaging, correction_agreement,
+    correction_left_out;
 
 /*
  * In the order in which they run. The detector's lag is of all that it has counted, scatter too. Defects of the map are
@@ -18,9 +20,9 @@ extern const struct correction correction_lag, correction_scatter, correction_fl
  * averaged when the rays that are left out are known. The check of the geometry changes nothing.
  */
 const struct correction *const corrections[CORRECTION_COUNT] = {
-    &correction_lag,       &correction_scatter, &correction_flat_dark,  &correction_defects,   &correction_air_region,
-    &correction_hardening, &correction_samples, &correction_truncation, &correction_exterior,  &correction_blank_views,
-    &correction_metal,     &correction_dense,   &correction_averaging,  &correction_agreement,
+    &correction_lag,         &correction_scatter, &correction_flat_dark,  &correction_defects,   &correction_air_region,
+    &correction_hardening,   &correction_samples, &correction_truncation, &correction_dense,     &correction_exterior,
+    &correction_blank_views, &correction_metal,   &correction_left_out,   &correction_averaging, &correction_agreement,
 };
 
 static bool is_wanted(const struct correction *row, const struct recipe *recipe, const struct linearise *linearise)
@@ -93,10 +95,13 @@ int corrections_open(struct correction_chain *ret_chain, const struct correction
 	int code = 0;
 
 	*ret_chain = (struct correction_chain){.job = *job, .input = input};
+	ret_chain->job.dense = calloc(1, sizeof(*ret_chain->job.dense));
+	if (ret_chain->job.dense == NULL)
+		return error_set(err, ERR_NO_MEMORY, "no memory for a list of dense voxels");
 	if (counts_wanted(&input->given)) {
 		ret_chain->counts = malloc(input->pixels * sizeof(float));
 		if (ret_chain->counts == NULL)
-			return error_set(err, ERR_NO_MEMORY, "no memory for the counts of a view");
+			code = error_set(err, ERR_NO_MEMORY, "no memory for the counts of a view");
 	}
 	for (int i = 0; i < CORRECTION_COUNT && code == 0; i++)
 		if (corrections[i]->open != NULL && chain_has(ret_chain, i))
@@ -114,6 +119,8 @@ void corrections_close(struct correction_chain *chain)
 	memset(chain->state, 0, sizeof(chain->state));
 	free(chain->counts);
 	chain->counts = NULL;
+	free(chain->job.dense);
+	chain->job.dense = NULL;
 }
 
 /* Corrects the counts of a view, chain->counts. */

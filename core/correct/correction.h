@@ -61,6 +61,7 @@ struct correction_job {
 	bool *outside;                     /* set where matter outside of the grid was taken out of the projections */
 	bool *left_out_dense;              /* set where rays through what is very dense were left out of them */
 	double *settled;                   /* iterations after which relaxation falls (averaging.h); INFINITY: never */
+	struct metal *dense;               /* what is very dense, and its traces (dense.h); the chain's own */
 	const struct warning_sink *warnings;
 	const struct cancel *cancel;
 };
@@ -149,7 +150,7 @@ struct correction {
 	int (*resume)(const struct correction_job *job, void *state, const void *bytes, size_t size, struct error *err);
 };
 
-enum { CORRECTION_COUNT = 14 };
+enum { CORRECTION_COUNT = 15 };
 extern const struct correction *const corrections[CORRECTION_COUNT];
 
 /* The corrections of one reconstruction. */

@@ -9,14 +9,14 @@
  *
  * Dense are voxels of DENSE times water's attenuation or more, in the volume that the iterations begin with, and what
  * belongs to the same object (metal_find). The list of them is what a run that goes on gets.
+ *
+ * What is as dense outside of the grid is found in the model of the exterior (dense_outside.c), which lies between the
+ * two rows here: one finds, the other leaves out.
  */
 #include <stdlib.h>
 
-#include "core/correct/correction.h"
-#include "core/correct/metal.h"
+#include "core/correct/dense.h"
 
-/* Times water's attenuation; cortical bone has up to 3.0. */
-static const double DENSE = 3.1;
 /*
  * An object that is dense itself, with more than this share of dense voxels among those of half of water and more,
  * keeps its rays: without them iterations would be left with nothing.
@@ -56,16 +56,15 @@ static int bytes_of(const struct correction_ask *ask, struct correction_bytes *b
 
 static int open_dense(const struct correction_job *job, void **ret_state, struct error *err)
 {
-	(void)job;
-	*ret_state = calloc(1, sizeof(struct metal));
-	return *ret_state != NULL ? 0 : error_set(err, ERR_NO_MEMORY, "no memory for a list of dense voxels");
+	(void)err;
+	*ret_state = job->dense;
+	return 0;
 }
 
 static void close_dense(void *state)
 {
 	if (state != NULL)
 		metal_clear(state);
-	free(state);
 }
 
 static int find_traces(const struct correction_job *job, struct metal *dense, struct error *err)
@@ -103,76 +102,107 @@ static int has_any(const struct correction_job *job, double least, bool *ret_any
 	return code;
 }
 
-/* Dense voxels: how many, those of the object, and the mean of their values, 1/mm. */
-struct dense_count {
-	size_t dense, object;
-	double mean;
-};
+void dense_add(struct dense_count *to, const float *values, size_t count, double mu_water)
+{
+	const float body = (float)(OBJECT * mu_water), dense = (float)(DENSE_LEAST * mu_water);
 
-static int count_dense(const struct correction_job *job, double least, struct dense_count *ret_count, struct error *err)
+	for (size_t i = 0; i < count; i++) {
+		to->object += values[i] >= body;
+		if (values[i] >= dense) {
+			to->dense++;
+			to->mean += (double)values[i];
+		}
+	}
+}
+
+void dense_counted(struct dense_count *count)
+{
+	count->mean = count->dense > 0 ? count->mean / (double)count->dense : 0;
+}
+
+bool dense_is_most(const struct dense_count *count)
+{
+	return (double)count->dense > FEW * (double)count->object;
+}
+
+static int count_dense(const struct correction_job *job, struct dense_count *ret_count, struct error *err)
 {
 	const struct grid *grid = &job->recipe->grid;
 	const size_t slice = (size_t)grid->size[0] * (size_t)grid->size[1];
-	const float body = (float)(OBJECT * job->recipe->mu_water), dense = (float)least;
 	float *values = malloc(slice * sizeof(*values));
-	size_t object = 0, found = 0;
-	double sum = 0;
+	struct dense_count count = {0};
 	int code = values != NULL ? 0 : error_set(err, ERR_NO_MEMORY, "no memory for a slice of %zu voxels", slice);
 
 	for (int z = 0; z < grid->size[2] && code == 0; z++) {
 		code = job->backend->volume_download(job->volume, z, 1, values, err);
-		for (size_t i = 0; i < slice && code == 0; i++) {
-			object += values[i] >= body;
-			if (values[i] >= dense) {
-				found++;
-				sum += (double)values[i];
-			}
-		}
+		if (code == 0)
+			dense_add(&count, values, slice, job->recipe->mu_water);
 	}
 	free(values);
-	if (code != 0)
-		return code;
-	*ret_count = (struct dense_count){found, object, found > 0 ? sum / (double)found : 0};
-	return 0;
+	dense_counted(&count);
+	if (code == 0)
+		*ret_count = count;
+	return code;
 }
 
 /* The list is empty where nothing is dense, and where too much of the object is. */
 static int find(const struct correction_job *job, struct metal *dense, struct dense_count *ret_count, struct error *err)
 {
 	const struct metal_tools tools = metal_tools_of(job);
-	const double least = DENSE * job->recipe->mu_water;
+	const double least = DENSE_LEAST * job->recipe->mu_water;
 	bool does = false;
 	int code = has_any(job, least, &does, err);
 
 	if (code == 0 && does)
-		code = count_dense(job, least, ret_count, err);
-	if (code < 0 || !does || (double)ret_count->dense > FEW * (double)ret_count->object)
+		code = count_dense(job, ret_count, err);
+	if (code < 0 || !does || dense_is_most(ret_count))
 		return code;
 	return metal_find(dense, &tools, job->volume, least, err);
 }
 
 /* Of all rays, those that pass what is dense. */
-static double share_of(const struct correction_job *job, const struct metal *dense)
+static double share_of(const struct geometry *geometry, const struct metal *dense)
 {
-	const struct geometry *geometry = job->geometry;
-
 	return (double)dense->replaced / ((double)geometry->count * (double)geometry->columns * (double)geometry->rows);
+}
+
+bool dense_passes_too_many(const struct dense_count *count, const struct metal *dense, const struct geometry *geometry,
+			   double mu_water)
+{
+	return share_of(geometry, dense) > RAYS_MOST && count->mean < SURELY * mu_water;
+}
+
+static void tell_left_out(const struct correction_job *job, const struct metal *dense)
+{
+	const double hu = 1000 * (DENSE_LEAST - 1), share = 100 * share_of(job->geometry, dense);
+
+	if (dense->found > 0)
+		warning_tell(job->warnings, "rays_left_out",
+			     "%zu voxels have at least %g HU or belong to such: iterations leave out the %.3g %% of "
+			     "the rays that pass them%s",
+			     dense->found, hu, share, dense->filled ? ", or what is as dense outside of the grid" : "");
+	else
+		warning_tell(job->warnings, "rays_left_out",
+			     "something outside of the grid has at least %g HU: iterations leave out the %.3g %% of "
+			     "the rays that pass it",
+			     hu, share);
 }
 
 static int leave_out(const struct correction_job *job, struct metal *dense, struct error *err)
 {
 	struct metal_tools tools = metal_tools_of(job);
+	int code = 0;
 
 	if (dense->traces_count == 0)
 		return 0;
 	tools.slots = slots_of(job->geometry);
 	*job->left_out_dense = true;
-	if (*job->iteration == 0)
-		warning_tell(job->warnings, "rays_left_out",
-			     "%zu voxels have at least %g HU or belong to such: iterations leave out the %.3g %% of "
-			     "the rays that pass them",
-			     dense->found, 1000 * (DENSE - 1), 100 * share_of(job, dense));
-	return metal_leave_out(dense, &tools, err);
+	/* The start has the model of the exterior where few views see, and no metal is in that. */
+	if (*job->iteration == 0 && dense->filled)
+		code = metal_show(dense, &tools, job->volume, err);
+	if (code == 0 && *job->iteration == 0)
+		tell_left_out(job, dense);
+	return code == 0 ? metal_leave_out(dense, &tools, err) : code;
 }
 
 static void tell_kept(const struct correction_job *job, const struct dense_count *count)
@@ -181,7 +211,7 @@ static void tell_kept(const struct correction_job *job, const struct dense_count
 	    job->warnings, "very_dense",
 	    "%zu voxels have at least %g HU, %.3g %% of those of the object, and %.0f HU in the mean: too many, "
 	    "or too many rays pass them, to leave those rays out of the iterations",
-	    count->dense, 1000 * (DENSE - 1), 100 * (double)count->dense / (double)count->object,
+	    count->dense, 1000 * (DENSE_LEAST - 1), 100 * (double)count->dense / (double)count->object,
 	    1000 * (count->mean / job->recipe->mu_water - 1));
 }
 
@@ -202,11 +232,20 @@ static int apply(const struct correction_job *job, void *state, enum correction_
 	if (code == 0)
 		code = find_traces(job, state, err);
 	/* A run that goes on has the list of what was left out, or none. */
-	if (code == 0 && first && share_of(job, state) > RAYS_MOST && count.mean < SURELY * job->recipe->mu_water)
+	if (code == 0 && first && dense_passes_too_many(&count, state, job->geometry, job->recipe->mu_water))
 		metal_clear(state);
 	if (code == 0 && count.dense > 0 && ((const struct metal *)state)->traces_count == 0)
 		tell_kept(job, &count);
-	return code == 0 ? leave_out(job, state, err) : code;
+	return code;
+}
+
+static int apply_left_out(const struct correction_job *job, void *state, enum correction_time time, bool *ret_changed,
+			  struct error *err)
+{
+	(void)state;
+	(void)time;
+	(void)ret_changed;
+	return job->subsets ? leave_out(job, job->dense, err) : 0;
 }
 
 static const void *found(const void *state, size_t *ret_bytes)
@@ -225,7 +264,7 @@ static int resume(const struct correction_job *job, void *state, const void *byt
 extern const struct correction correction_dense;
 const struct correction correction_dense = {
     .name = "dense",
-    .summary = "rays through what is very dense are left out of the iterations, where metal is not taken out",
+    .summary = "rays through what is very dense are found, where metal is not taken out",
     .times = 1U << CORRECT_BEFORE_ITERATING,
     .needs = NEEDS_WHOLE_IMAGES | NEEDS_ALL_VIEWS | NEEDS_VOLUME,
     .wanted = wanted,
@@ -235,4 +274,14 @@ const struct correction correction_dense = {
     .apply = apply,
     .found = found,
     .resume = resume,
+};
+
+extern const struct correction correction_left_out;
+const struct correction correction_left_out = {
+    .name = "left out",
+    .summary = "rays through what is very dense are left out of the iterations",
+    .times = 1U << CORRECT_BEFORE_ITERATING,
+    .needs = NEEDS_WHOLE_IMAGES | NEEDS_ALL_VIEWS | NEEDS_VOLUME,
+    .wanted = wanted,
+    .apply = apply_left_out,
 };

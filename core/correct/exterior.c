@@ -9,13 +9,21 @@
 #include "core/correct/exterior_rows.h"
 #include "core/correct/exterior_views.h"
 
+/* Rows of a view, and which of their ends say nothing: sides that FDK pads, and those in the shadow of what is dense.
+ */
+struct ends_known {
+	const int *pad;
+	const struct metal *dense;
+	int view;
+};
+
 /* One view on the host, [row][column]: line integrals as measured, through w and through w on the recipe's grid. */
 struct projection {
 	int steps;
 	const struct exterior_rows *seen;
 	const struct view *view;
 	int columns, rows;
-	const int *pad;
+	struct ends_known known;
 	const struct faces *faces; /* of w; NULL: FDK is too poor for that */
 	float *measured;
 	float largest;                   /* truncation_largest of it */
@@ -24,13 +32,16 @@ struct projection {
 	double *smooth;                  /* to work in */
 };
 
-/* A side that FDK pads is none of a truncated row; neither are ends that the tube alone keeps from 0. */
-static bool is_truncated(const int pad[2], const float *row, int columns, float largest, float air)
+/* Ends that the tube alone keeps from 0 are none of a truncated row. */
+static bool is_truncated(const struct ends_known *known, int at, const float *row, int columns, float largest,
+			 float air)
 {
 	const float level = truncation_level(largest) + fmaxf(air, 0);
+	bool covered[2];
 
-	return (pad[0] == 0 && truncation_is_cut(row, 1, columns, level)) ||
-	       (pad[1] == 0 && truncation_is_cut(row + columns - 1, -1, columns, level));
+	metal_edges_of(known->dense, known->view, at, columns, covered);
+	return (known->pad[0] == 0 && !covered[0] && truncation_is_cut(row, 1, columns, level)) ||
+	       (known->pad[1] == 0 && !covered[1] && truncation_is_cut(row + columns - 1, -1, columns, level));
 }
 
 /* Sums of e and column e over the columns first .. last. */
@@ -83,7 +94,7 @@ static struct exterior_rows subtract_row(const struct projection *of, int row)
 	if (of->steps & EXTERIOR_BEYOND && row >= of->seen->first && row <= of->seen->last)
 		found.truncated = 1;
 	else if (of->steps & EXTERIOR_BEYOND)
-		found.truncated = is_truncated(of->pad, measured, of->columns, of->largest, of->air);
+		found.truncated = is_truncated(&of->known, row, measured, of->columns, of->largest, of->air);
 	if (found.truncated == 0 && of->steps & EXTERIOR_OUTSIDE && of->faces != NULL &&
 	    faces_row_counts_outside(of->faces, of->view, of->columns, row, measured, explained, of->largest))
 		found.outside = 1;
@@ -125,11 +136,12 @@ static struct exterior_rows look_at_rows(const struct exterior_volume_options *o
 	const float air = air_level(measured, columns, rows, truncation_edge(columns), largest);
 	const struct outside_rows outside =
 	    outside_rows(options->grid, &geometry->views[view], columns, rows, measured);
+	const struct ends_known known = {options->orbit->pad, options->dense, view};
 	struct exterior_rows found = {
 	    .beside = outside.beside, .outside = outside.beside + outside.ends, .first = rows, .last = -1};
 
 	for (int r = 0; r < rows; r++)
-		if (is_truncated(options->orbit->pad, measured + (size_t)r * (size_t)columns, columns, largest, air)) {
+		if (is_truncated(&known, r, measured + (size_t)r * (size_t)columns, columns, largest, air)) {
 			found.truncated++;
 			found.first = r < found.first ? r : found.first;
 			found.last = r;
@@ -241,7 +253,7 @@ int exterior_subtract(const struct exterior_volume *exterior, const struct exter
 			    .view = &geometry->views[first + i],
 			    .columns = geometry->columns,
 			    .rows = geometry->rows,
-			    .pad = options->orbit->pad,
+			    .known = {options->orbit->pad, options->dense, first + i},
 			    .faces = options->poor ? NULL : &faces,
 			    .measured = measured + at,
 			    .largest = largest,

@@ -2,6 +2,7 @@
 #include <math.h>
 
 #include "core/correct/blank.h"
+#include "core/correct/dense.h"
 #include "core/correct/exterior.h"
 #include "core/correct/input.h"
 #include "core/correct/truncated.h"
@@ -119,6 +120,52 @@ static void warn_of_zero(const struct correction_job *job)
 		    reach, radius);
 }
 
+/* What the projections show of the exterior: which rows count it, and the model of it that they ask for. */
+static int look(const struct correction_job *job, struct exterior_volume_options *options,
+		struct exterior_rows *ret_seen, struct error *err)
+{
+	const bool sound = !options->poor, fdk = job->recipe->fdk.on;
+	struct exterior_rows seen;
+	int code = exterior_look(options, &seen, err);
+
+	if (code < 0)
+		return code;
+	/* Rows that are cut off may be wanted as they are; what lies outside of the grid is another matter. */
+	if (!job->recipe->fdk.extend) {
+		seen.truncated = 0;
+		seen.last = -1;
+	}
+	/* An object may end inside of the grid: FDK's blur beyond its faces is none of the object. */
+	options->inside_only = seen.outside == 0 && !seen.possible;
+	/* From zero, iterations take too long to fill what is held beside the field of view where the grid has that. */
+	options->truncated = seen.truncated > 0 && sound && fdk && !options->inside_only;
+	if (!options->truncated)
+		seen.last = -1;
+	*ret_seen = seen;
+	return 0;
+}
+
+static bool shows_nothing(const struct exterior_rows *seen)
+{
+	return seen->truncated + seen->outside == 0 && !seen->possible;
+}
+
+/* The model of the exterior without what is very dense; *ret_seen may show nothing then, and there is none. */
+static int make(const struct correction_job *job, struct exterior_volume_options *options,
+		struct exterior_volume *exterior, struct exterior_rows *ret_seen, struct error *err)
+{
+	bool filled = false;
+	int code = exterior_volume_make(exterior, options, err);
+
+	if (code == 0 && !options->poor)
+		code = dense_take_outside(job, exterior, &filled, err);
+	if (code < 0 || !filled)
+		return code;
+	exterior_volume_clear(exterior);
+	code = look(job, options, ret_seen, err);
+	return code == 0 && !shows_nothing(ret_seen) ? exterior_volume_make(exterior, options, err) : code;
+}
+
 /*
  * The exterior is found from the projections alone, so that a run that goes on from an iterate gives the same bits.
  * `work` holds the iterate before the iteration, which the first iteration writes anyway.
@@ -139,21 +186,17 @@ static int apply(const struct correction_job *job, void *state, enum correction_
 	    .blank = job->input->blank,
 	    .blanks = job->input->counts.blank,
 	    .poor = !sound,
+	    .dense = job->dense,
 	    .cancel = job->cancel,
 	};
 	struct exterior_volume exterior = {0};
 	struct exterior_rows seen, rows = {0};
-	int code = exterior_look(&options, &seen, err);
+	int code = look(job, &options, &seen, err);
 
 	(void)state;
 	(void)time;
 	(void)ret_changed;
-	/* Rows that are cut off may be wanted as they are; what lies outside of the grid is another matter. */
-	if (!job->recipe->fdk.extend) {
-		seen.truncated = 0;
-		seen.last = -1;
-	}
-	if (code < 0 || (seen.truncated + seen.outside == 0 && !seen.possible))
+	if (code < 0 || shows_nothing(&seen))
 		return code;
 	if (!sound && !fdk && seen.truncated > 0)
 		warning_tell(job->warnings, "truncated",
@@ -161,14 +204,12 @@ static int apply(const struct correction_job *job, void *state, enum correction_
 			     "out of the projections: SART piles it up in the grid");
 	if (!sound && !fdk && seen.outside == 0 && !seen.possible)
 		return 0;
-	/* An object may end inside of the grid: FDK's blur beyond its faces is none of the object. */
-	options.inside_only = seen.outside == 0 && !seen.possible;
-	/* From zero, iterations take too long to fill what is held beside the field of view where the grid has that. */
-	options.truncated = seen.truncated > 0 && sound && fdk && !options.inside_only;
-	if (!options.truncated)
-		seen.last = -1;
-	code = exterior_volume_make(&exterior, &options, err);
-	if (code == 0 && options.truncated && *job->iteration == 0)
+	code = make(job, &options, &exterior, &seen, err);
+	if (code < 0 || shows_nothing(&seen)) {
+		exterior_volume_clear(&exterior);
+		return code;
+	}
+	if (options.truncated && *job->iteration == 0)
 		code = job->wide(job->wide_context, err);
 	if (code == 0)
 		code = subtract(job, &options, &seen, &exterior, &rows, err);

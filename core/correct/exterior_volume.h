@@ -1,6 +1,7 @@
 #ifndef CBCT_CORE_SURROUNDINGS_H
 #define CBCT_CORE_SURROUNDINGS_H
 
+#include "core/correct/metal.h"
 #include "core/fdk.h"
 
 /*
@@ -49,6 +50,8 @@ struct exterior_volume_options {
 	bool poor;        /* FDK is, and not to be believed outside of the recipe's grid */
 	bool truncated;   /* rows are, so that the object goes on beside the field of view */
 	bool inside_only; /* leaves what lies outside of the recipe's grid away */
+	/* Traces of what is very dense, which are filled: a row says nothing of where they meet the detector's edge. */
+	const struct metal *dense;
 	const struct cancel *cancel;
 };
 

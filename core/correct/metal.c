@@ -251,39 +251,8 @@ int metal_note_dark(struct metal *metal, int view, int row, int first, int last,
 	return 0;
 }
 
-static int compare_traces(const void *left, const void *right)
-{
-	const struct metal_trace *a = left, *b = right;
-
-	if (a->view != b->view)
-		return a->view < b->view ? -1 : 1;
-	if (a->row != b->row)
-		return a->row < b->row ? -1 : 1;
-	return (a->first > b->first) - (a->first < b->first);
-}
-
-size_t metal_traces_from(const struct metal_trace *traces, size_t count, int view)
-{
-	size_t low = 0, high = count;
-
-	while (low < high) {
-		const size_t middle = low + (high - low) / 2;
-
-		if (traces[middle].view < view)
-			low = middle + 1;
-		else
-			high = middle;
-	}
-	return low;
-}
-
 /* ---- lines over them ---- */
 
-/*
- * Pixels on either side of a trace whose mean the line starts from: one alone
- * would draw its noise over the trace, with more the line starts too far away.
- */
-enum { FLANK = 2 };
 /* The column is searched so many times as far as the row's ends are: what lies beyond has no weight. */
 enum { COLUMN_SEARCH = 4 };
 
@@ -303,11 +272,13 @@ static struct flank flank_of(const struct metal_view *of, int column, int row, i
 		const int c = column + away * dx, r = row + away * dy;
 		const size_t at = (size_t)r * (size_t)of->columns + (size_t)c;
 
+		if (of->air_beyond && pixels == 0 && (c < 0 || c >= of->columns))
+			return (struct flank){.place = away, .nearest = away};
 		if (c < 0 || c >= of->columns || r < 0 || r >= of->rows)
 			break;
 		if (of->trace[at] && pixels == 0)
 			continue;
-		if (of->trace[at] || pixels == FLANK || (dy != 0 && !metal_is_whole(of, c, r)))
+		if (of->trace[at] || pixels == METAL_FLANK || (dy != 0 && !metal_is_whole(of, c, r)))
 			break;
 		flank.place += away;
 		flank.value += (double)of->values[at] - (of->prior != NULL ? (double)of->prior[at] : 0);
@@ -438,7 +409,7 @@ static bool *draw_traces(const struct metal *metal, const struct metal_tools *to
 }
 
 /* Treatments of a view that has traces. */
-enum treatment { TRACE, FILL, FILL_OVER_PRIOR, LEAVE_OUT };
+enum treatment { TRACE, FILL, FILL_OVER_PRIOR, FILL_TO_AIR, LEAVE_OUT };
 
 static void treat_view(const struct metal_tools *tools, const struct metal_batch *batch, int i,
 		       enum treatment treatment, const bool *trace)
@@ -449,8 +420,10 @@ static void treat_view(const struct metal_tools *tools, const struct metal_batch
 	    .columns = columns,
 	    .rows = rows,
 	    .values = batch->views + (size_t)i * pixels,
-	    .prior = treatment == FILL_OVER_PRIOR ? batch->shadow + (size_t)i * pixels : NULL,
+	    .prior =
+		treatment == FILL_OVER_PRIOR || treatment == FILL_TO_AIR ? batch->shadow + (size_t)i * pixels : NULL,
 	    .trace = trace,
+	    .air_beyond = treatment == FILL_TO_AIR,
 	    .grid = tools->grid,
 	    .view = &tools->geometry->views[batch->first + i],
 	};
@@ -539,7 +512,7 @@ static int treat_all(struct metal *metal, const struct metal_tools *tools, enum 
 		code = error_set(err, ERR_NO_MEMORY, "no memory for %zu projections", 2 * slots);
 	for (; batch.first < all && code == 0; batch.first += batch.count) {
 		batch.count = all - batch.first < tools->slots ? all - batch.first : tools->slots;
-		if (treatment == TRACE || treatment == FILL_OVER_PRIOR)
+		if (treatment != FILL && treatment != LEAVE_OUT)
 			code = metal_project_batch(tools, tools->volume, &batch, err);
 		if (code == 0 && treatment == TRACE)
 			code = trace_batch(metal, tools, &batch, err);
@@ -651,6 +624,24 @@ static int make_prior(const struct metal_tools *tools, const double bone[2], str
 	return code;
 }
 
+static float set(struct metal *metal, size_t i, float there, double value)
+{
+	(void)metal;
+	(void)i;
+	(void)there;
+	return (float)value;
+}
+
+int metal_fill(struct metal *metal, struct metal *without, const struct metal_tools *tools, struct error *err)
+{
+	int code = make_prior(tools, BONE_FIRST, err);
+
+	if (code == 0)
+		code = change_slices(without, tools, tools->volume, set, 0, err);
+	metal->filled = true;
+	return code == 0 ? treat_all(metal, tools, FILL_TO_AIR, err) : code;
+}
+
 int metal_find_traces(struct metal *metal, const struct metal_tools *tools, struct error *err)
 {
 	int code = tools->backend->volume_fill(tools->volume, 0, err);
@@ -658,7 +649,7 @@ int metal_find_traces(struct metal *metal, const struct metal_tools *tools, stru
 	metal->traces_count = metal->replaced = 0;
 	metal->views = 0;
 	if (metal->dark_count > 0)
-		qsort(metal->dark, metal->dark_count, sizeof(*metal->dark), compare_traces);
+		qsort(metal->dark, metal->dark_count, sizeof(*metal->dark), metal_compare_traces);
 	if (code == 0)
 		code = change_slices(metal, tools, tools->volume, set_core, 1, err);
 	return code < 0 ? code : treat_all(metal, tools, TRACE, err);

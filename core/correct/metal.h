@@ -34,6 +34,7 @@ struct metal {
 	size_t dark_count, dark_room;
 	size_t replaced; /* samples in traces */
 	int views;       /* with any */
+	bool filled;     /* metal_fill was there */
 };
 void metal_clear(struct metal *metal);
 
@@ -83,6 +84,19 @@ int metal_find_traces(struct metal *metal, const struct metal_tools *tools, stru
 /* Replaces them in the projections. After metal_find_traces. */
 int metal_replace(struct metal *metal, const struct metal_tools *tools, struct error *err);
 
+/* Adds the traces of another list. */
+int metal_add_traces(struct metal *metal, const struct metal *other, struct error *err);
+/* Traces that leave too little to the detector's edge to begin a line from go up to it. True if any does. */
+bool metal_reach_edges(struct metal *metal, int columns);
+/* Whether a trace covers the row's first column, and its last one. */
+void metal_edges_of(const struct metal *metal, int view, int row, int columns, bool ret_covered[2]);
+/*
+ * Fills the traces with what tools->volume, an FDK volume that becomes a prior without the voxels of another list,
+ * explains of them, and with lines of the difference to that: between what lies beside them, or to 0 at the detector's
+ * edge, for a shadow of metal that is cut off says nothing of the object.
+ */
+int metal_fill(struct metal *metal, struct metal *without, const struct metal_tools *tools, struct error *err);
+
 /* FDK of all projections, in the order of their numbers, instead of what is in `to`. */
 int metal_fdk(const struct metal_tools *tools, struct volume *to, struct error *err);
 
@@ -124,6 +138,7 @@ struct metal_view {
 	 */
 	const struct grid *grid;
 	const struct view *view; /* NULL without a grid */
+	bool air_beyond;         /* along a row, a trace that meets the detector's edge ends in air there */
 };
 
 /*

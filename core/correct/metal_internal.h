@@ -3,7 +3,7 @@
 
 #include "core/correct/metal.h"
 
-/* Declarations that the files of the metal stage share: metal_find.c, metal.c, metal_blend.c. */
+/* Declarations that the files of the metal stage share: metal_find.c, metal.c, metal_traces.c, metal_blend.c. */
 
 size_t metal_slice_voxels(const struct grid *grid);
 /* `items` with room for one more than `count`; NULL, and they are as they were, where there is no memory. */
@@ -11,6 +11,14 @@ void *metal_grown(void *items, size_t size, size_t count, size_t *room);
 
 /* First of the list's voxels of this slice or a later one. */
 size_t metal_voxels_from(const struct metal *metal, int z);
+/*
+ * Pixels on either side of a trace whose mean the line starts from: one alone
+ * would draw its noise over the trace, with more the line starts too far away.
+ */
+enum { METAL_FLANK = 2 };
+
+/* For qsort: by view, row, column. */
+int metal_compare_traces(const void *left, const void *right);
 /* First of the traces, in order, of this view or a later one. */
 size_t metal_traces_from(const struct metal_trace *traces, size_t count, int view);
 
