@@ -27,25 +27,25 @@
 
 /*
  * The lanes of one axis, and how many they are; the others, and those that miss
- * the grid, follow an active lane with no weight, which keeps all indices close
- * together.
+ * the grid, follow an active lane beside them with no weight, which keeps
+ * positions in order and all indices close together.
  */
 static int rays_select(const struct rays *rays, int axis, struct rays *ret)
 {
-	int active = -1, count = 0;
+	int from = 0, count = 0;
 
-	for (int l = 0; l < LANES; l++) {
+	for (int l = LANES - 1; l >= 0; l--) {
 		if (rays->axis[l] == axis) {
-			active = l;
+			from = l;
 			count++;
 		}
 	}
 	if (count == 0)
 		return 0;
 	for (int l = 0; l < LANES; l++) {
-		bool on = rays->axis[l] == axis;
-		int from = on ? l : active;
+		const bool on = rays->axis[l] == axis;
 
+		from = on ? l : from;
 		ret->begin[l] = on ? rays->begin[l] : 1e9f;
 		ret->end[l] = on ? rays->end[l] : -1e9f;
 		ret->b[l] = rays->b[from];
@@ -120,88 +120,157 @@ static inline vf march(const struct rays *rays, const struct axes *axes, const f
  * Pixels that are neighbours along a column of the detector cross a slice almost
  * along z when the detector is turned but a little: then a few columns of voxels
  * hold all samples of LANES rays, and each lane looks up its own in windows of
- * 2 LANES of them. Positions across run one way from lane to lane, so the first
- * and the last one bound all.
+ * LANES of them, or 2 LANES where pixels are coarse. Positions across run one way
+ * from lane to lane, so the first and the last one bound all.
  */
 enum { SLICES_AT_ONCE = 16 }; /* whose crossings are worked out together */
 struct crossings {
 	int columns[SLICES_AT_ONCE];              /* 2 or 3 lie beside the rays; 0: they are too far apart */
 	int b[SLICES_AT_ONCE], c[SLICES_AT_ONCE]; /* the lowest */
+	int wide[SLICES_AT_ONCE];                 /* 1: windows of 2 LANES */
+	int ahead[SLICES_AT_ONCE];                /* from c to what the next LANES rays read first */
 };
 
-static void crossings_set(const struct rays *rays, int middle, int first, int count, struct crossings *ret)
+static void crossings_set(const struct rays *rays, const struct axes *axes, int first, int count, struct crossings *ret)
 {
 	const float b0 = rays->b[0], b1 = rays->b[LANES - 1], c0 = rays->c[0], c1 = rays->c[LANES - 1];
 	const float b_slope0 = rays->b_slope[0], b_slope1 = rays->b_slope[LANES - 1];
 	const float c_slope0 = rays->c_slope[0], c_slope1 = rays->c_slope[LANES - 1];
+	const float top = (float)(axes->c_size - 1);
 
 	for (int k = 0; k < count; k++) {
-		const float along = (float)(first + k - middle);
+		const float along = (float)(first + k - axes->slices / 2);
 		const float first_b = b0 + along * b_slope0, last_b = b1 + along * b_slope1;
 		const float first_c = c0 + along * c_slope0, last_c = c1 + along * c_slope1;
 		const float b = floorf(first_b < last_b ? first_b : last_b);
-		const float c = floorf((first_c < last_c ? first_c : last_c) - MARGIN);
 		const float across = (first_b < last_b ? last_b : first_b) - b;
-		const float length = (first_c < last_c ? last_c : first_c) - c + MARGIN;
+		const float step = (last_c - first_c) * (LANES / (float)(LANES - 1)); /* to the next LANES */
+		float low = (first_c < last_c ? first_c : last_c) - MARGIN;
+		float high = (first_c < last_c ? last_c : first_c) + MARGIN;
 
+		low = low < 0 ? 0 : low < top ? floorf(low) : top;
+		high = high < 0 ? 0 : high < top ? high : top;
 		ret->b[k] = (int)b;
-		ret->c[k] = (int)c;
-		ret->columns[k] = length >= 2 * LANES - 1 || across >= 2 ? 0 : across < 1 ? 2 : 3;
+		ret->c[k] = (int)low;
+		ret->columns[k] = high - low >= 2 * LANES - 1 || across >= 2 ? 0 : across < 1 ? 2 : 3;
+		ret->wide[k] = high - low >= LANES - 1;
+		ret->ahead[k] = (int)(step > 0 ? step + (float)(ret->wide[k] ? 2 * LANES : LANES) : step - 1);
 	}
 }
 
-/* Sample at (b, c) counted from `from`, with the kinks; b lies between the first two, or three, columns. */
-static inline vf window_sample(const float *from, size_t stride, int columns, vf b, vf c, vf slope, vf inverse)
+/* kink(y) where y is not negative; inverse = 1 / slope, sixth = slope / 6. */
+static inline vf kink_beyond(vf y, vf inverse, vf sixth)
 {
-	const vf zero = vf_all(0), one = vf_all(1);
-	const vf kink0 = kink(b, slope, inverse), kink1 = kink(b - one, slope, inverse);
-	const vf kink2 = columns == 2 ? zero : kink(b - 2 * one, slope, inverse);
-	const vf hat0 = columns == 2 ? one - b : vf_max(one - b, zero);
-	const vf hat2 = columns == 2 ? zero : vf_max(b - one, zero);
+	const vf part = vf_max(vf_fma(-y, inverse, vf_all(1)), vf_all(0));
+
+	return part * part * (part * sixth);
+}
+
+/*
+ * Sample at (b, c) counted from column first_b and from the voxel `from` of column 0, with the kinks; b lies between
+ * the first two, or three, columns. `held`: some columns may lie beyond the grid, which holds its outer values there,
+ * and a c on the last voxel reads beyond its column what then has no weight.
+ */
+static inline __attribute__((always_inline)) vf window_sample(const struct axes *axes, const float *from, int first_b,
+							      int columns, bool wide, bool held, vf b, vf c, vf inverse,
+							      vf sixth)
+{
+	const vf zero = vf_all(0), one = vf_all(1), b1 = b - one;
+	const vf kink0 = kink_beyond(b, inverse, sixth);
+	const vf kink1 = kink_beyond(columns == 2 ? -b1 : vf_max(b1, -b1), inverse, sixth);
+	const vf kink2 = columns == 2 ? zero : kink_beyond(one - b1, inverse, sixth);
+	const vf hat0 = columns == 2 ? -b1 : vf_max(-b1, zero);
+	const vf hat2 = columns == 2 ? zero : vf_max(b1, zero);
 	const vf hat1 = columns == 2 ? b : one - hat0 - hat2;
-	const vf parts[5] = {kink0, hat0 - 2 * kink0 + kink1, hat1 + kink0 - 2 * kink1 + kink2,
-			     hat2 + kink1 - 2 * kink2, kink2};
+	const vf minus2 = vf_all(-2);
+	const vf parts[5] = {kink0, vf_fma(minus2, kink0, hat0) + kink1, vf_fma(minus2, kink1, hat1) + (kink0 + kink2),
+			     vf_fma(minus2, kink2, hat2) + kink1, kink2};
 	vf upper, below = zero, above = zero;
-	vi index = vf_split(c, &upper);
+	const vi index = vf_split(c, &upper), next = index + 1;
 
-	from -= stride;
-	for (int k = 0; k < columns + 2; k++, from += stride) {
-		const vf low = vf_load(from), high = vf_load(from + LANES);
+	for (int k = 0; k < columns + 2; k++) {
+		int j = first_b - 1 + k;
+		const float *column;
 
-		below = vf_fma(parts[k], vf_window(low, high, index), below);
-		above = vf_fma(parts[k], vf_window(low, high, index + 1), above);
+		if (held)
+			j = j < 0 ? 0 : j < axes->b_size ? j : axes->b_size - 1;
+		column = from + (size_t)j * axes->b_stride;
+		if (wide) {
+			const vf low = vf_load(column), high = vf_load(column + LANES);
+
+			below = vf_fma(parts[k], vf_window(low, high, index), below);
+			above = vf_fma(parts[k], vf_window(low, high, next), above);
+		} else {
+			const vf voxels = vf_load(column);
+
+			below = vf_fma(parts[k], vf_look_up(voxels, index), below);
+			above = vf_fma(parts[k], vf_look_up(voxels, next), above);
+		}
 	}
 	return vf_fma(upper, above - below, below);
 }
 
-/* Sums up at most SLICES_AT_ONCE slices that lie whole between entry and exit and are crossed well inside; c runs along
- * z. */
-static vf march_inside(const struct rays *rays, const struct axes *axes, const float *volume, int first, int last)
+/*
+ * Sums up slices; c runs along z. `whole`: those that lie whole between entry and exit of all rays and are crossed well
+ * inside, else any. What the next LANES rays of the column need of the slice is asked for now: it lies in many columns,
+ * a line of the cache in each, which no processor foresees, and waiting for memory took two thirds of the time.
+ */
+static inline __attribute__((always_inline)) vf march_windows(const struct rays *rays, const struct axes *axes,
+							      const float *volume, int first, int last, bool whole)
 {
+	const vf begin = vf_load(rays->begin), end = vf_load(rays->end);
 	const vf b0 = vf_load(rays->b), c0 = vf_load(rays->c);
 	const vf b_slope = vf_load(rays->b_slope), c_slope = vf_load(rays->c_slope);
 	const vf slope = vf_max(b_slope, -b_slope), inverse = 1 / vf_max(slope, vf_all(SLOPE_LEAST));
-	const int middle = axes->slices / 2;
+	const vf sixth = slope * (1 / 6.f), top = vf_all((float)(axes->c_size - 1));
 	struct crossings at;
 	vf sum = vf_all(0);
 
-	crossings_set(rays, middle, first, last - first + 1, &at);
-	for (int i = first; i <= last; i++) {
-		const int k = i - first;
-		const vf along = vf_all((float)(i - middle));
-		const vf b = vf_fma(along, b_slope, b0) - (float)at.b[k];
-		const vf c = vf_fma(along, c_slope, c0) - (float)at.c[k];
-		const float *from =
-		    volume + (size_t)i * axes->slice + (size_t)at.b[k] * axes->b_stride + (size_t)at.c[k];
+	for (int i = first, k = SLICES_AT_ONCE; i <= last; i++, k++) {
+		const vf along = vf_all((float)(i - axes->slices / 2));
+		const float *from = volume + (size_t)i * axes->slice;
+		vf b, c = vf_fma(along, c_slope, c0), sample;
 
-		if (at.columns[k] == 0)
+		if (k == SLICES_AT_ONCE) {
+			crossings_set(rays, axes, i, last - i < SLICES_AT_ONCE ? last - i + 1 : SLICES_AT_ONCE, &at);
+			k = 0;
+		}
+		if (at.columns[k] == 0) {
 			sum += march(rays, axes, volume, i, i);
-		else if (at.columns[k] == 2)
-			sum += window_sample(from, axes->b_stride, 2, b, c, slope, inverse);
+			continue;
+		}
+		b = vf_fma(along, b_slope, b0) - (float)at.b[k];
+		c = (whole ? c : vf_clamp(c, vf_all(0), top)) - (float)at.c[k];
+		from += at.c[k];
+		for (int j = -1; j < 3; j++)
+			__builtin_prefetch(from + (ptrdiff_t)(at.b[k] + j) * (ptrdiff_t)axes->b_stride + at.ahead[k], 0,
+					   2);
+		if (at.wide[k])
+			sample = at.columns[k] == 2
+				     ? window_sample(axes, from, at.b[k], 2, true, !whole, b, c, inverse, sixth)
+				     : window_sample(axes, from, at.b[k], 3, true, !whole, b, c, inverse, sixth);
 		else
-			sum += window_sample(from, axes->b_stride, 3, b, c, slope, inverse);
+			sample = at.columns[k] == 2
+				     ? window_sample(axes, from, at.b[k], 2, false, !whole, b, c, inverse, sixth)
+				     : window_sample(axes, from, at.b[k], 3, false, !whole, b, c, inverse, sixth);
+		if (!whole) {
+			vf weight = vf_min(vf_all((float)i + .5f), end) - vf_max(vf_all((float)i - .5f), begin);
+
+			sample *= vf_max(weight, vf_all(0));
+		}
+		sum += sample;
 	}
 	return sum;
+}
+
+static vf march_inside(const struct rays *rays, const struct axes *axes, const float *volume, int first, int last)
+{
+	return march_windows(rays, axes, volume, first, last, true);
+}
+
+static vf march_ends(const struct rays *rays, const struct axes *axes, const float *volume, int first, int last)
+{
+	return march_windows(rays, axes, volume, first, last, false);
 }
 
 /* LANES neighbouring rays on their way through the grid. */
@@ -231,9 +300,11 @@ static bool bundle_inside(const struct axes *axes, struct bundle *bundle)
 
 /*
  * All that needs masks, edges or gathers; what march_inside can do is left to it.
- * `column`: the rays are neighbours along a column of pixels.
+ * `step`: from one ray to the next where they are neighbours along a column of
+ * pixels, the first of which has that direction; else NULL.
  */
-static void bundle_begin(const struct axes axes[3], bool column, const float *volume, struct bundle *bundle)
+static void bundle_begin(const struct axes axes[3], const double direction[3], const double *step, const float *volume,
+			 struct bundle *bundle)
 {
 	vf sum = vf_all(0), length = vf_all(0);
 
@@ -242,6 +313,8 @@ static void bundle_begin(const struct axes axes[3], bool column, const float *vo
 		struct rays rays;
 		const int count = rays_select(&bundle->rays, a, &rays);
 		const vf begin = vf_load(rays.begin), end = vf_load(rays.end);
+		/* No ray between the first and the last runs the other way, nor along the slices. */
+		const bool ordered = a < 2 && step != NULL && direction[a] * (direction[a] + (LANES - 1) * step[a]) > 0;
 		int first, last;
 
 		if (count == 0)
@@ -251,13 +324,17 @@ static void bundle_begin(const struct axes axes[3], bool column, const float *vo
 		last = (int)ceilf(vf_highest(end) - .5f);
 		first = first < 0 ? 0 : first;
 		last = last > axes[a].slices - 1 ? axes[a].slices - 1 : last;
-		if (column && a < 2 && count == LANES && bundle_inside(&axes[a], bundle)) {
+		if (!ordered) {
+			sum += a < 2 ? march(&rays, &axes[a], volume, first, last)
+				     : march(&rays, &axes[2], volume, first, last);
+			continue;
+		}
+		if (count == LANES && bundle_inside(&axes[a], bundle)) {
 			bundle->axis = a;
-			sum += march(&rays, &axes[a], volume, first, bundle->first - 1);
+			sum += march_ends(&rays, &axes[a], volume, first, bundle->first - 1);
 			first = bundle->last + 1;
 		}
-		sum +=
-		    a < 2 ? march(&rays, &axes[a], volume, first, last) : march(&rays, &axes[2], volume, first, last);
+		sum += march_ends(&rays, &axes[a], volume, first, last);
 	}
 	vf_store(bundle->sum, sum);
 	vf_store(bundle->length, length);
@@ -318,7 +395,8 @@ static void project_general(const struct plan *plan, int view_index, int column,
 				rays_set(plan, view->source, direction,
 					 plan->along_rows ? view->row_step : view->column_step, lanes_along - first,
 					 &bundles[k].rays);
-				bundle_begin(axes, plan->along_rows, volume, &bundles[k]);
+				bundle_begin(axes, direction, plan->along_rows ? view->row_step : NULL, volume,
+					     &bundles[k]);
 			}
 			bundles_end(axes, volume, bundles, together);
 			for (int k = 0; k < together; k++) {

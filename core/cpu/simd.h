@@ -165,6 +165,12 @@ static inline void vf_gather_pair(const float *from, vi index, vf *ret_a, vf *re
 	*ret_b = (vf)_mm512_permutex2var_ps(first, _mm512_add_epi32(even, _mm512_set1_epi32(1)), last);
 }
 
+/* Looks up each lane's index, of which only 0 .. LANES - 1 counts, in a register. */
+static inline vf vf_look_up(vf from, vi index)
+{
+	return (vf)_mm512_permutexvar_ps((__m512i)index, (__m512)from);
+}
+
 /* Looks up each lane's index, of which only 0 .. 2 LANES - 1 counts, in two registers. */
 static inline vf vf_window(vf low, vf high, vi index)
 {
@@ -209,6 +215,11 @@ static inline void vf_gather_pair(const float *from, vi index, vf *ret_a, vf *re
 {
 	*ret_a = vf_gather(from, index);
 	*ret_b = vf_gather(from + 1, index);
+}
+
+static inline vf vf_look_up(vf from, vi index)
+{
+	return (vf)_mm256_permutevar8x32_ps((__m256)from, (__m256i)index);
 }
 
 static inline vf vf_window(vf low, vf high, vi index)
@@ -270,6 +281,15 @@ static inline void vf_gather_pair(const float *from, vi index, vf *ret_a, vf *re
 {
 	*ret_a = vf_gather(from, index);
 	*ret_b = vf_gather(from + 1, index);
+}
+
+static inline vf vf_look_up(vf from, vi index)
+{
+	vf v;
+
+	for (int l = 0; l < LANES; l++)
+		v[l] = from[index[l] & (LANES - 1)];
+	return v;
 }
 
 static inline vf vf_window(vf low, vf high, vi index)
