@@ -157,6 +157,9 @@ void seal_maker_add(struct seal_maker *maker, const void *bytes, size_t size)
 	size_t first = maker->at, end = first + size;
 	int from = (int)(first / SEAL_BLOCK), to = block_count(end);
 
+	/* zlib takes bytes at NULL for a wish to begin anew. */
+	if (size == 0)
+		return;
 #pragma omp parallel for schedule(dynamic) if (to - from > 2)
 	for (int block = from; block < to; block++) {
 		size_t begin = (size_t)block * SEAL_BLOCK, last = begin + SEAL_BLOCK;

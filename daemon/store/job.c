@@ -13,6 +13,7 @@
 #include "daemon/store/record.h"
 #include "proto/checkpoint.h"
 #include "proto/clock.h"
+#include "proto/refining_file.h"
 
 const char *const job_state_names[JOB_STATE_COUNT] = {"waiting",   "queued", "running",
 						      "succeeded", "failed", "cancelled"};
@@ -166,17 +167,26 @@ void store_job_remove_files(const struct store *store, const char *id)
 	store_reserve_save(store);
 }
 
-void store_job_remove_checkpoint(const struct store *store, const char *id)
+static void remove_file(const struct store *store, const char *id, const char *name)
 {
-	static const char *const files[] = {CHECKPOINT_FILE, CHECKPOINT_FILE_BEFORE};
 	char directory[1024], path[1100];
 
 	store_job_directory(store, id, directory);
-	for (size_t i = 0; i < sizeof(files) / sizeof(files[0]); i++) {
-		snprintf(path, sizeof(path), "%s/%s", directory, files[i]);
-		if (unlink(path) < 0 && errno != ENOENT && errno != ENOTDIR)
-			log_line(LEVEL_WARNING, "job %s: %s stays: %s", id, path, strerror(errno));
-	}
+	snprintf(path, sizeof(path), "%s/%s", directory, name);
+	if (unlink(path) < 0 && errno != ENOENT && errno != ENOTDIR)
+		log_line(LEVEL_WARNING, "job %s: %s stays: %s", id, path, strerror(errno));
+}
+
+void store_job_remove_checkpoint(const struct store *store, const char *id)
+{
+	remove_file(store, id, CHECKPOINT_FILE);
+	remove_file(store, id, CHECKPOINT_FILE_BEFORE);
+}
+
+void store_job_remove_reached(const struct store *store, const char *id)
+{
+	store_job_remove_checkpoint(store, id);
+	remove_file(store, id, REFINING_FILE);
 }
 
 static int remove_volume(void *context, const char *name, struct error *err)
@@ -218,7 +228,7 @@ void store_job_tidy(const struct store *store, const char *id)
 	char directory[1024];
 	struct error err;
 
-	store_job_remove_checkpoint(store, id);
+	store_job_remove_reached(store, id);
 	store_job_directory(store, id, directory);
 	if (directory_visit(directory, remove_temporary, directory, &err) != 0)
 		log_line(LEVEL_WARNING, "job %s: half-written files stay until the next start: %s", id, err.text);

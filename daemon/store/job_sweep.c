@@ -146,7 +146,7 @@ static int sweep_directory(void *context, const char *name, struct error *err)
 	store_job_directory(sweep.store, name, path);
 	sweep.ended = state == JOB_SUCCEEDED || state == JOB_FAILED || state == JOB_CANCELLED;
 	if (sweep.ended) /* the daemon may have died before it was through with this */
-		store_job_remove_checkpoint(sweep.store, name);
+		store_job_remove_reached(sweep.store, name);
 	code = store_job_volumes(sweep.store, name, &sweep.volumes, &sweep.count, err);
 	if (code != 0)
 		return code;

@@ -518,6 +518,8 @@ int store_job_update(struct store *store, const struct job_record *job, const st
 int store_job_delete(struct store *store, const char *id, struct error *err);
 void store_job_remove_files(const struct store *store, const char *id);
 void store_job_remove_checkpoint(const struct store *store, const char *id);
+/* The checkpoint, and what a refinement has reached: nobody goes on from an end. */
+void store_job_remove_reached(const struct store *store, const char *id);
 /* The files of all its volumes, whose rows have gone. */
 void store_job_remove_volumes(const struct store *store, const char *id);
 /* The checkpoint, and what a worker that died left half-written or prepared: an ended job has no use for it. */

@@ -365,6 +365,7 @@ START_TEST(a_checkpoint_is_kept_over_a_restart_where_its_file_is)
 	keep_id(without, without_id);
 	ck_assert_int_eq(directory_make(state_path(&state, "jobs/%s", with_id), &err), 0);
 	path_fill(state_path(&state, "jobs/%s/checkpoint.f32", with_id));
+	path_fill(state_path(&state, "jobs/%s/refining", with_id));
 	for (int i = 0; i < 2; i++) {
 		struct job *job = i == 0 ? with : without;
 
@@ -384,9 +385,11 @@ START_TEST(a_checkpoint_is_kept_over_a_restart_where_its_file_is)
 	job_record(without, &record);
 	ck_assert_int_eq(record.checkpoint, 0);
 	ck_assert_int_eq(rows_of(without_id), 0);
+	ck_assert(path_exists(state_path(&state, "jobs/%s/refining", with_id)));
 	state_set(with, JOB_RUNNING, NULL);
-	state_set(with, JOB_SUCCEEDED, NULL);
+	state_set(with, JOB_CANCELLED, NULL);
 	ck_assert(!path_exists(state_path(&state, "jobs/%s/checkpoint.f32", with_id)));
+	ck_assert(!path_exists(state_path(&state, "jobs/%s/refining", with_id)));
 	job_release(with);
 	job_release(without);
 	/* As a daemon leaves it that dies before it has removed the files of a job that has ended. */

@@ -21,6 +21,7 @@
 
 #include "core/scan/phantom.h"
 #include "proto/format.h"
+#include "proto/refining_file.h"
 #include "proto/saver.h"
 #include "proto/seal.h"
 #include "proto/checkpoint.h"
@@ -1093,6 +1094,44 @@ START_TEST(a_run_on_a_device_of_its_own_memory_has_its_checkpoints_prepared)
 }
 END_TEST
 
+/* Pieces of which some are empty, as a refinement without a volume of its own has them. */
+START_TEST(what_a_refinement_has_reached_is_there_for_the_next_run)
+{
+	static const char first[] = "a head", second[] = "squares", third[] = "a volume";
+	const struct refine_state reached = {{{first, sizeof(first)},
+					      {second, sizeof(second)},
+					      {NULL, 0},
+					      {NULL, 0},
+					      {third, sizeof(third)},
+					      {NULL, 0}}};
+	const struct refine_keep *keep;
+	struct refining_file *file;
+	struct error err;
+
+	ck_assert_int_eq(refining_file_open(out, 7, 3600, &file, &err), 0);
+	keep = refining_file_keep(file);
+	ck_assert_ptr_null(keep->state);
+	ck_assert(keep->due(keep->context, true) && !keep->due(keep->context, false));
+	ck_assert_int_eq(keep->keep(keep->context, &reached, &err), 0);
+	refining_file_free(file);
+	for (uint64_t basis = 7; basis < 9; basis++) {
+		ck_assert_int_eq(refining_file_open(out, basis, 3600, &file, &err), 0);
+		keep = refining_file_keep(file);
+		if (basis == 7) {
+			ck_assert_uint_eq(keep->bytes, sizeof(first) + sizeof(second) + sizeof(third));
+			ck_assert_mem_eq(keep->state, first, sizeof(first));
+			ck_assert_mem_eq((const char *)keep->state + sizeof(first) + sizeof(second), third,
+					 sizeof(third));
+		} else {
+			ck_assert_ptr_null(keep->state);
+		}
+		refining_file_free(file);
+	}
+	refining_file_remove(out);
+	ck_assert_int_eq(count_files(out), 0);
+}
+END_TEST
+
 static void assert_goes_on(const struct phantom *phantom, const char *warning)
 {
 	static const char request[] = "{\"scan\":\"s\",\"grid\":{\"size\":[24,20,12],\"spacing_mm\":[4,5,6]},"
@@ -1276,6 +1315,7 @@ Suite *scan_directory_suite(void)
 	tcase_add_test(pipelines, projections_that_make_no_sense_are_refused);
 	tcase_add_test(pipelines, a_scan_of_what_is_there_is_as_if_no_more_had_been_planned);
 	tcase_add_test(pipelines, a_run_that_yields_goes_on_to_the_same_bits);
+	tcase_add_test(pipelines, what_a_refinement_has_reached_is_there_for_the_next_run);
 	tcase_add_test(pipelines, a_run_keeps_checkpoints_while_it_goes_on);
 	tcase_add_test(pipelines, a_run_on_a_device_of_its_own_memory_has_its_checkpoints_prepared);
 	tcase_add_test(pipelines, a_body_wider_than_the_detector_goes_on_from_its_checkpoint);
