@@ -14,7 +14,7 @@ static const double KNOWN_LEAST = 0.95; /* of the views */
 /* The part of the frequencies from which on they are noise. */
 static const double NOISE_FROM = 0.6;
 /* From where on it is told (tests/bench/results/refine.txt). */
-static const double SHARE = 0.002, TIMES = 1.4, BEYOND_NOISE = 2.5;
+static const double SHARE = 0.002, TIMES = 1.7, BEYOND_NOISE = 2.5;
 /* Where only the whole has such a hill. SAME: times in the sweep. */
 static const double UNEVEN_SHARE = 0.0005, UNEVEN_PART = 0.05, UNEVEN_TIMES = 1.3, UNEVEN_BEYOND_NOISE = 1.5,
 		    SAME = 1.5;
