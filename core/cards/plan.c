@@ -454,9 +454,7 @@ static void summarise(struct plan *plan)
 	for (int c = 0; c < plan->parts; c++)
 		most = plan->card[c].geometry.rows > most ? plan->card[c].geometry.rows : most;
 	snprintf(plan->summary, sizeof(plan->summary),
-		 "%d cards%s: slabs of %d slices (views on each card are not made yet), seen by %d of %d rows, %d "
-		 "views at a "
-		 "time; %.150s",
+		 "%d cards%s: slabs of %d slices, seen by %d of %d rows, %d views at a time; %.150s",
 		 plan->device->count, plan->device->connected ? "" : " through the host", card->grid.size[2], most,
 		 plan->options.geometry->rows, plan->batch,
 		 backend->plan_summary(card->between != NULL ? card->between : card->slab));

@@ -56,7 +56,7 @@ test_a_job_has_several_devices() {
 	post_job "$(with "$endless" '"devices": 2')"
 	job_becomes '.state == "running" and .iteration > 0'
 	expect_json '.devices == 2 and .ran_on == [0, 1] and (.device | startswith("2 x ")) and (.plan | startswith("2 cards"))'
-	expect_json '.plan | contains("slabs of 16 slices (views on each card are not made yet)")'
+	expect_json '.plan | contains("slabs of 16 slices, seen by")'
 	first=$job
 	devices_become ".devices | [.[].state] == [\"busy\", \"lent\", \"idle\"] and .[0].job == \"$first\" and .[1].job == \"$first\" and .[1].answers and .[2].job == null"
 	# The third one is still to be had, and the two are not.
