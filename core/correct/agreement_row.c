@@ -155,7 +155,7 @@ static void tell_breathing(const struct correction_job *job, const struct agreem
 	warning_tell(job->warnings, "breathing",
 		     "what a row of the detector shows comes and goes about %.0f times in the sweep, by %.2g %% (root "
 		     "mean square), %.2g times what is slower and %.2g times the noise there: no object at rest does "
-		     "that, wherever the arm stood",
+		     "that, unless the arm shakes as often along its axis",
 		     hill->times_in_sweep, 100 * hill->share, hill->times, hill->share / hill->noise);
 }
 
