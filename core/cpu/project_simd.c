@@ -125,10 +125,13 @@ static inline vf march(const struct rays *rays, const struct axes *axes, const f
  */
 enum { SLICES_AT_ONCE = 16 }; /* whose crossings are worked out together */
 struct crossings {
-	int columns[SLICES_AT_ONCE];              /* 2 or 3 lie beside the rays; 0: they are too far apart */
-	int b[SLICES_AT_ONCE], c[SLICES_AT_ONCE]; /* the lowest */
-	int wide[SLICES_AT_ONCE];                 /* 1: windows of 2 LANES */
-	int ahead[SLICES_AT_ONCE];                /* from c to what the next LANES rays read first */
+	int columns[SLICES_AT_ONCE]; /* 2 or 3 lie beside the rays; 0: they are too far apart */
+	int wide[SLICES_AT_ONCE];    /* 1: windows of 2 LANES */
+	int ahead[SLICES_AT_ONCE];   /* from c to what the next LANES rays read first */
+	float along[SLICES_AT_ONCE]; /* the slice, counted from the middle one */
+	/* The lowest, whole numbers, and where that voxel of the column before b lies from the volume's first. */
+	float b[SLICES_AT_ONCE], c[SLICES_AT_ONCE];
+	int64_t from[SLICES_AT_ONCE];
 };
 
 static void crossings_set(const struct rays *rays, const struct axes *axes, int first, int count, struct crossings *ret)
@@ -150,8 +153,11 @@ static void crossings_set(const struct rays *rays, const struct axes *axes, int 
 
 		low = low < 0 ? 0 : low < top ? floorf(low) : top;
 		high = high < 0 ? 0 : high < top ? high : top;
-		ret->b[k] = (int)b;
-		ret->c[k] = (int)low;
+		ret->along[k] = along;
+		ret->b[k] = b;
+		ret->c[k] = low;
+		ret->from[k] = (int64_t)(first + k) * (int64_t)axes->slice +
+			       (int64_t)((int)b - 1) * (int64_t)axes->b_stride + (int)low;
 		ret->columns[k] = high - low >= 2 * LANES - 1 || across >= 2 ? 0 : across < 1 ? 2 : 3;
 		ret->wide[k] = high - low >= LANES - 1;
 		ret->ahead[k] = (int)(step > 0 ? step + (float)(ret->wide[k] ? 2 * LANES : LANES) : step - 1);
@@ -167,9 +173,9 @@ static inline vf kink_beyond(vf y, vf inverse, vf sixth)
 }
 
 /*
- * Sample at (b, c) counted from column first_b and from the voxel `from` of column 0, with the kinks; b lies between
- * the first two, or three, columns. `held`: some columns may lie beyond the grid, which holds its outer values there,
- * and a c on the last voxel reads beyond its column what then has no weight.
+ * Sample at (b, c) counted from column first_b and from the voxel `from` of the column before it, with the kinks; b
+ * lies between the first two, or three, columns. `held`: some columns may lie beyond the grid, which holds its outer
+ * values there, and a c on the last voxel reads beyond its column what then has no weight.
  */
 static inline __attribute__((always_inline)) vf window_sample(const struct axes *axes, const float *from, int first_b,
 							      int columns, bool wide, bool held, vf b, vf c, vf inverse,
@@ -189,12 +195,10 @@ static inline __attribute__((always_inline)) vf window_sample(const struct axes 
 	const vi index = vf_split(c, &upper), next = index + 1;
 
 	for (int k = 0; k < columns + 2; k++) {
-		int j = first_b - 1 + k;
-		const float *column;
+		const int j = first_b - 1 + k, last = axes->b_size - 1;
+		const int there = !held ? k : (j < 0 ? 0 : j < last ? j : last) - (first_b - 1);
+		const float *column = from + (ptrdiff_t)there * (ptrdiff_t)axes->b_stride;
 
-		if (held)
-			j = j < 0 ? 0 : j < axes->b_size ? j : axes->b_size - 1;
-		column = from + (size_t)j * axes->b_stride;
 		if (wide) {
 			const vf low = vf_load(column), high = vf_load(column + LANES);
 
@@ -223,42 +227,43 @@ static inline __attribute__((always_inline)) vf march_windows(const struct rays 
 	const vf b_slope = vf_load(rays->b_slope), c_slope = vf_load(rays->c_slope);
 	const vf slope = vf_max(b_slope, -b_slope), inverse = 1 / vf_max(slope, vf_all(SLOPE_LEAST));
 	const vf sixth = slope * (1 / 6.f), top = vf_all((float)(axes->c_size - 1));
-	struct crossings at;
 	vf sum = vf_all(0);
 
-	for (int i = first, k = SLICES_AT_ONCE; i <= last; i++, k++) {
-		const vf along = vf_all((float)(i - axes->slices / 2));
-		const float *from = volume + (size_t)i * axes->slice;
-		vf b, c = vf_fma(along, c_slope, c0), sample;
+	for (int slice = first; slice <= last; slice += SLICES_AT_ONCE) {
+		const int count = last - slice < SLICES_AT_ONCE ? last - slice + 1 : SLICES_AT_ONCE;
+		struct crossings at;
 
-		if (k == SLICES_AT_ONCE) {
-			crossings_set(rays, axes, i, last - i < SLICES_AT_ONCE ? last - i + 1 : SLICES_AT_ONCE, &at);
-			k = 0;
-		}
-		if (at.columns[k] == 0) {
-			sum += march(rays, axes, volume, i, i);
-			continue;
-		}
-		b = vf_fma(along, b_slope, b0) - (float)at.b[k];
-		c = (whole ? c : vf_clamp(c, vf_all(0), top)) - (float)at.c[k];
-		from += at.c[k];
-		for (int j = -1; j < 3; j++)
-			__builtin_prefetch(from + (ptrdiff_t)(at.b[k] + j) * (ptrdiff_t)axes->b_stride + at.ahead[k], 0,
-					   2);
-		if (at.wide[k])
-			sample = at.columns[k] == 2
-				     ? window_sample(axes, from, at.b[k], 2, true, !whole, b, c, inverse, sixth)
-				     : window_sample(axes, from, at.b[k], 3, true, !whole, b, c, inverse, sixth);
-		else
-			sample = at.columns[k] == 2
-				     ? window_sample(axes, from, at.b[k], 2, false, !whole, b, c, inverse, sixth)
-				     : window_sample(axes, from, at.b[k], 3, false, !whole, b, c, inverse, sixth);
-		if (!whole) {
-			vf weight = vf_min(vf_all((float)i + .5f), end) - vf_max(vf_all((float)i - .5f), begin);
+		crossings_set(rays, axes, slice, count, &at);
+		for (int k = 0; k < count; k++) {
+			const vf along = vf_all(at.along[k]);
+			const int i = slice + k, first_b = (int)at.b[k];
+			const float *from = volume + at.from[k];
+			vf b = vf_fma(along, b_slope, b0) - at.b[k], c = vf_fma(along, c_slope, c0), sample;
 
-			sample *= vf_max(weight, vf_all(0));
+			if (at.columns[k] == 0) {
+				sum += march(rays, axes, volume, i, i);
+				continue;
+			}
+			c = (whole ? c : vf_clamp(c, vf_all(0), top)) - at.c[k];
+			for (int j = 0; j < 4; j++)
+				__builtin_prefetch(from + (ptrdiff_t)j * (ptrdiff_t)axes->b_stride + at.ahead[k], 0, 2);
+			if (at.wide[k])
+				sample =
+				    at.columns[k] == 2
+					? window_sample(axes, from, first_b, 2, true, !whole, b, c, inverse, sixth)
+					: window_sample(axes, from, first_b, 3, true, !whole, b, c, inverse, sixth);
+			else
+				sample =
+				    at.columns[k] == 2
+					? window_sample(axes, from, first_b, 2, false, !whole, b, c, inverse, sixth)
+					: window_sample(axes, from, first_b, 3, false, !whole, b, c, inverse, sixth);
+			if (!whole) {
+				vf weight = vf_min(vf_all((float)i + .5f), end) - vf_max(vf_all((float)i - .5f), begin);
+
+				sample *= vf_max(weight, vf_all(0));
+			}
+			sum += sample;
 		}
-		sum += sample;
 	}
 	return sum;
 }
