@@ -11,7 +11,11 @@
 #include <zlib.h>
 #include <zstd.h>
 
-enum { WINDOW_LOG_MAX = 23 /* 8 MiB */ };
+enum {
+	WINDOW_LOG_MAX = 23, /* 8 MiB */
+	JOB_BYTES =
+	    512 << 10 /* that one thread is given, the least there is: an encoder then holds 5 MB in place of 17 */
+};
 
 struct zdecoder {
 	ZSTD_DCtx *context;
@@ -79,8 +83,10 @@ int zencoder_new(int level, int workers, struct zencoder **ret_encoder, struct e
 		return error_set(err, ERR_NO_MEMORY, "no memory for a zstd encoder");
 	}
 	/* A library that was built without threads refuses, and does it all in ours. */
-	if (workers > 0)
+	if (workers > 0) {
 		ZSTD_CCtx_setParameter(encoder->context, ZSTD_c_nbWorkers, workers);
+		ZSTD_CCtx_setParameter(encoder->context, ZSTD_c_jobSize, JOB_BYTES);
+	}
 	*ret_encoder = encoder;
 	return 0;
 }

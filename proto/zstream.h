@@ -24,7 +24,8 @@ struct zencoder;
 int gzip_encoder_new(int level, struct zencoder **ret_encoder, struct error *err);
 /*
  * workers: threads of its own that compress while more is given, 0 none. The
- * frame depends on there being any, not on how many.
+ * frame depends on there being any, not on how many: with one, the same input in
+ * the same pieces gives the same bytes as with two, for 2 to 3 MB less.
  */
 int zencoder_new(int level, int workers, struct zencoder **ret_encoder, struct error *err);
 /* Before the first step, of zstd: looks for repetitions only as far back as the nearest caches hold. */

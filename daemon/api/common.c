@@ -151,8 +151,9 @@ void entity_headers(struct request *request, const struct entity *entity, const 
 	if (entity->filename != NULL)
 		request_reply_header(request, "Content-Disposition", "attachment; filename=\"%s\"", entity->filename);
 	add_caching(request, entity);
-	if (entity->size != UNKNOWN_SIZE)
-		request_reply_header(request, "Accept-Ranges", "bytes");
+	if (entity->size != UNKNOWN_SIZE || entity->ranges != NULL)
+		request_reply_header(request, "Accept-Ranges", "%s",
+				     entity->size != UNKNOWN_SIZE ? "bytes" : entity->ranges);
 	if (selection->status == 206)
 		request_reply_header(request, "Content-Range", "bytes %" PRIu64 "-%" PRIu64 "/%" PRIu64,
 				     selection->first, selection->first + selection->length - 1, entity->size);

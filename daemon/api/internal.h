@@ -123,10 +123,11 @@ int idempotency_read(struct request *request, char ret_text[IDEMPOTENCY_SIZE], s
 /* Bytes that do not change while they bear this tag. */
 struct entity {
 	const char *etag; /* quoted, strong */
-	uint64_t size;    /* UNKNOWN_SIZE: no ranges */
+	uint64_t size;    /* UNKNOWN_SIZE: no ranges of this reply */
 	const char *media_type;
 	const char *filename; /* NULL: none, it is shown where it is asked for */
 	const char *caching;  /* Cache-Control; NULL: clients keep it, and ask each time whether it has changed */
+	const char *ranges;   /* Accept-Ranges of what has no known size; NULL: nothing is said */
 };
 /*
  * If-Match, If-None-Match, Range and If-Range. *ret_done: the reply is set (412, 304, 416);

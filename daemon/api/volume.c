@@ -1,4 +1,5 @@
 /* /v1/jobs/{}/volumes */
+#include <errno.h>
 #include <fcntl.h>
 #include <stdio.h>
 #include <stdlib.h>
@@ -317,9 +318,10 @@ static int reply_plain(struct request *request, struct content *content, const s
 /* Takes the content. encoding: what compresses it is not the media type's own. */
 static int reply_packed(struct request *request, struct content *content, bool encoding, struct error *err)
 {
+	const int workers = 1; /* so that the bytes are those of the encoded copy, whose maker has two */
 	struct content_stream *stream;
 
-	if (content_stream_new(content, 0, &stream, err) != 0 ||
+	if (content_stream_new(content, workers, &stream, err) != 0 ||
 	    request_reply_read(request, 200, UNKNOWN_SIZE, stream_read, stream, stream_free, err) != 0)
 		return err->code;
 	if (encoding)
@@ -341,43 +343,100 @@ static int verify_selected(struct api *api, const char *job, const struct volume
 	return volume_verify(api, job, volume, first, bytes, err);
 }
 
-int volume_get(void *context, struct request *request, struct error *err)
+/* ---- ranges of what is packed ---- */
+
+static void watch_copy(void *copy, struct watch *watch)
 {
-	struct api *api = context;
-	struct content_options options;
-	struct volume_record volume;
+	encoded_watch(copy, watch);
+}
+
+static void leave_copy(void *copy, struct watch *watch)
+{
+	encoded_unwatch(copy, watch);
+	encoded_release(copy);
+}
+
+/*
+ * True if the request is for a range of bytes whose number nobody knows before they are made. The pages of DICOM are
+ * not among the encoded copies.
+ */
+static bool wants_range_of_copy(struct request *request, const struct content_options *options, const char *etag)
+{
+	const char *condition = request_header(request, "If-Range");
+	uint64_t first, length;
+
+	return content_is_packed(options) && !options->dicom && !request_is_head(request) &&
+	       (condition == NULL || etag_in(condition, etag, false)) &&
+	       range_parse(request_header(request, "Range"), UNKNOWN_SIZE, &first, &length) != RANGE_NONE;
+}
+
+/* HTTP_WAIT while the encoded copy is made; without ret->made it cannot be, on a full disk for example. */
+static int wait_for_copy(struct api *api, struct request *request, const char *job, const struct volume_record *volume,
+			 const struct content_options *options, struct encoded_facts *ret, struct error *err)
+{
+	static const struct wait_kind kind = {watch_copy, leave_copy};
+	struct encoded *copy = wait_subject(request);
+
+	if (copy == NULL) {
+		if (encoded_get(api->copies, job, volume, options, true, &copy, err) != 0)
+			return err->code;
+		if (wait_begin(request, &kind, copy, api->max_wait, err) != 0) {
+			encoded_release(copy);
+			return err->code;
+		}
+	}
+	encoded_look(copy, ret);
+	return !ret->made && !ret->failed && wait_goes_on(request) ? HTTP_WAIT : 0;
+}
+
+/* *ret_replied false: there is no copy, and all of the volume goes out, as RFC 9110, 14.2 leaves it to a server. */
+static int reply_range_of_copy(struct api *api, struct request *request, const char *job,
+			       const struct volume_record *volume, const struct content_options *options,
+			       struct entity entity, bool *ret_replied, struct error *err)
+{
+	struct encoded_facts copy;
+	struct selection selection;
+	int descriptor, code = wait_for_copy(api, request, job, volume, options, &copy, err);
+
+	if (code != 0 || !copy.made)
+		return code;
+	entity.size = copy.size;
+	if (entity_select(request, &entity, &selection, ret_replied, err) != 0 || *ret_replied)
+		return *ret_replied ? 0 : err->code;
+	if (volume_verify(api, job, volume, 0, volume->bytes, err) != 0)
+		return err->code;
+	descriptor = fcntl(copy.descriptor, F_DUPFD_CLOEXEC, 0);
+	if (descriptor < 0)
+		return error_set_errno(err, errno, "an encoded copy of a volume");
+	if (request_reply_file(request, selection.status, descriptor, copy.offset + selection.first, selection.length,
+			       err) != 0)
+		return err->code;
+	entity_headers(request, &entity, &selection);
+	*ret_replied = true;
+	return 0;
+}
+
+/* ---- one volume ---- */
+
+/* Takes what the words of the options own. */
+static int reply_volume(struct api *api, struct request *request, const char *job, const struct volume_record *volume,
+			const struct content_options *options, struct entity entity, bool zstd, struct error *err)
+{
+	bool done, packed = content_is_packed(options);
 	struct selection selection;
 	struct content *content;
-	struct job_facts facts;
-	struct entity entity;
-	char etag[160], filename[VOLUME_FILENAME_MAX], path[1024];
-	/* Ranges are of the plain bytes: a frame of zstd cannot be entered in the middle. */
-	bool zstd = accepts_coding(request_header(request, "Accept-Encoding"), "zstd") &&
-		    (request_header(request, "Range") == NULL || request_is_head(request));
-	bool done, packed;
+	char path[1024];
 
-	if (volume_asked(api, request, &facts, &volume, err) != 0 ||
-	    volume_options(request, &facts, &options, err) != 0 ||
-	    volume_verify(api, facts.id, &volume, 0, 0, err) != 0)
+	store_volume_path(api->store, job, volume->name, path);
+	if (content_open(path, &volume->grid, options, &content, err) != 0)
 		return err->code;
-	store_volume_path(api->store, facts.id, volume.name, path);
-	/* What the words own is the content's. */
-	if (read_words(api, request, &volume, &options, err) != 0 ||
-	    content_open(path, &volume.grid, &options, &content, err) != 0)
-		return err->code;
-	packed = content_is_packed(&options);
-	zstd = options.shuffled || (zstd && !packed);
-	make_etag(facts.id, &volume, &options, zstd, etag, sizeof(etag));
-	volume_filename(facts.id, volume.name, &options, filename);
-	entity = (struct entity){.etag = etag,
-				 .size = zstd || packed ? UNKNOWN_SIZE : content_size(content),
-				 .media_type = volume_media_type(&options),
-				 .filename = filename};
+	if (!zstd && !packed)
+		entity.size = content_size(content);
 	if (entity_select(request, &entity, &selection, &done, err) != 0 || done) {
 		content_close(content);
 		return done ? 0 : err->code;
 	}
-	if (verify_selected(api, facts.id, &volume, content, zstd || packed ? NULL : &selection, err) != 0) {
+	if (verify_selected(api, job, volume, content, zstd || packed ? NULL : &selection, err) != 0) {
 		content_close(content);
 		return err->code;
 	}
@@ -386,6 +445,43 @@ int volume_get(void *context, struct request *request, struct error *err)
 		return err->code;
 	entity_headers(request, &entity, &selection);
 	return 0;
+}
+
+int volume_get(void *context, struct request *request, struct error *err)
+{
+	struct api *api = context;
+	struct content_options options;
+	struct volume_record volume;
+	struct job_facts facts;
+	struct entity entity;
+	char etag[160], filename[VOLUME_FILENAME_MAX];
+	const char *accepted = request_header(request, "Accept-Encoding");
+	/* A frame of zstd cannot be entered in the middle: a range is of the plain bytes, where they are acceptable. */
+	bool zstd = accepts_coding(accepted, "zstd") && (request_header(request, "Range") == NULL ||
+							 request_is_head(request) || !accepts_identity(accepted));
+	bool packed, replied = false;
+	int code;
+
+	if (volume_asked(api, request, &facts, &volume, err) != 0 ||
+	    volume_options(request, &facts, &options, err) != 0 ||
+	    volume_verify(api, facts.id, &volume, 0, 0, err) != 0 ||
+	    read_words(api, request, &volume, &options, err) != 0)
+		return err->code;
+	packed = content_is_packed(&options);
+	zstd = options.shuffled || (zstd && !packed);
+	make_etag(facts.id, &volume, &options, zstd, etag, sizeof(etag));
+	volume_filename(facts.id, volume.name, &options, filename);
+	entity = (struct entity){.etag = etag,
+				 .size = UNKNOWN_SIZE,
+				 .media_type = volume_media_type(&options),
+				 .filename = filename,
+				 .ranges = dicom_or(&options, "none", "none", packed ? "bytes" : NULL)};
+	if (wants_range_of_copy(request, &options, etag)) {
+		code = reply_range_of_copy(api, request, facts.id, &volume, &options, entity, &replied, err);
+		if (code != 0 || replied)
+			return code;
+	}
+	return reply_volume(api, request, facts.id, &volume, &options, entity, zstd, err);
 }
 
 static int job_started(struct api *api, const char *id, double *ret_started, struct error *err)

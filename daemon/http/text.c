@@ -2,6 +2,7 @@
 #include "daemon/http/text.h"
 
 #include <ctype.h>
+#include <math.h>
 #include <stdlib.h>
 #include <string.h>
 #include <strings.h>
@@ -94,10 +95,11 @@ enum range range_parse(const char *header, uint64_t size, uint64_t *ret_first, u
 	return RANGE_ONE;
 }
 
-bool accepts_coding(const char *header, const char *coding)
+/* The quality that an Accept-Encoding gives to this name; negative where it does not name it. */
+static double coding_quality(const char *header, const char *coding)
 {
 	if (header == NULL)
-		return false;
+		return -1;
 	while (*header != '\0') {
 		size_t length;
 		const char *parameter;
@@ -107,13 +109,27 @@ bool accepts_coding(const char *header, const char *coding)
 		parameter = header + strcspn(header, ",;");
 		if (length == strlen(coding) && strncasecmp(header, coding, length) == 0) {
 			if (*parameter != ';')
-				return true;
+				return 1;
 			parameter = skip_blanks(parameter + 1);
-			return strncasecmp(parameter, "q=", 2) != 0 || strtod(parameter + 2, NULL) > 0;
+			return strncasecmp(parameter, "q=", 2) == 0 ? fmax(strtod(parameter + 2, NULL), 0) : 1;
 		}
 		header += strcspn(header, ",");
 	}
-	return false;
+	return -1;
+}
+
+bool accepts_coding(const char *header, const char *coding)
+{
+	return coding_quality(header, coding) > 0;
+}
+
+bool accepts_identity(const char *header)
+{
+	double quality = coding_quality(header, "identity");
+
+	if (quality < 0)
+		quality = coding_quality(header, "*");
+	return quality != 0;
 }
 
 bool etag_in(const char *header, const char *etag, bool weak)

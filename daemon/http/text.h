@@ -25,6 +25,8 @@ enum range range_parse(const char *header /* or NULL */, uint64_t size, uint64_t
 
 /* Whether an Accept-Encoding names this coding (zstd, gzip) with a quality above 0. NULL: no. */
 bool accepts_coding(const char *header, const char *coding);
+/* Whether it leaves the plain bytes acceptable (RFC 9110, 12.5.3): only "identity;q=0", or "*;q=0" alone, does not. */
+bool accepts_identity(const char *header);
 
 /*
  * Whether a list of entity tags, or *, has this one (a strong one, quoted). weak:

@@ -189,7 +189,7 @@ test_grid_is_chosen_when_none_is_given() {
 }
 
 test_volumes_come_in_every_format() {
-	local voxels=$((32 * 24 * 16)) etag full first range
+	local voxels=$((32 * 24 * 16)) etag full first range size coding
 	uploaded_scan
 	post_job "$small"'"fdk": {}}'
 	wait_job succeeded
@@ -247,6 +247,48 @@ test_volumes_come_in_every_format() {
 	done
 	req GET "/v1/jobs/$job/volumes/final" -r 0-9 -H 'If-Range: "other"'
 	expect_status 200
+	# and of what is packed by its format, whose length is known when it is made
+	for full in format=nifti.gz "format=nifti.gz&type=int16" format=shuffled; do
+		get_volume final "$work/packed" "$full"
+		etag=$(header etag) size=$(stat -c %s "$work/packed")
+		[ "$(header accept-ranges)" = bytes ] || fail "Accept-Ranges: bytes of $full"
+		req GET "/v1/jobs/$job/volumes/final?$full" -r 301-1099 -H 'Accept-Encoding: zstd'
+		expect_status 206
+		[ "$(header etag)" = "$etag" ] || fail "the tag of the whole"
+		[ "$(header content-range)" = "bytes 301-1099/$size" ] || fail "Content-Range, got $(header content-range)"
+		dd if="$work/packed" iflag=skip_bytes,count_bytes skip=301 count=799 status=none | cmp - "$body" || fail "bytes 301-1099 of $full"
+		req GET "/v1/jobs/$job/volumes/final?$full" -r -500 -H "If-Range: $etag"
+		expect_status 206
+		tail -c 500 "$work/packed" | cmp - "$body" || fail "the last 500 bytes of $full"
+		req GET "/v1/jobs/$job/volumes/final?$full" -r 0-9 -H 'If-Range: "other"'
+		expect_status 200
+		cmp "$work/packed" "$body" || fail "all of it"
+		req GET "/v1/jobs/$job/volumes/final?$full" -r 99999999-
+		expect_problem 416
+		[ "$(header content-range)" = "bytes */$size" ] || fail "Content-Range: bytes */N"
+		req GET "/v1/jobs/$job/volumes/final?$full" -r 0-9 -H "If-None-Match: $etag"
+		expect_status 304
+		req HEAD "/v1/jobs/$job/volumes/final?$full" -H 'Range: bytes=0-9'
+		expect_status 200
+		[ "$(header etag)" = "$etag" ] || fail "the tag for HEAD"
+		[ "$(header accept-ranges)" = bytes ] || fail "Accept-Ranges: bytes for HEAD"
+	done
+	# A range is of the plain bytes, where the client takes them.
+	for coding in zstd "zstd, identity" "zstd;q=1, *;q=0, identity;q=0.5"; do
+		req GET "/v1/jobs/$job/volumes/final" -r 301-1099 -H "Accept-Encoding: $coding"
+		expect_status 206
+		[ -z "$(header content-encoding)" ] || fail "no coding of a range, got $(header content-encoding)"
+		dd if="$work/v.nii" iflag=skip_bytes,count_bytes skip=301 count=799 status=none | cmp - "$body" || fail "plain bytes beside $coding"
+	done
+	for coding in "zstd, identity;q=0" "zstd, *;q=0"; do
+		req GET "/v1/jobs/$job/volumes/final" -r 301-1099 -H "Accept-Encoding: $coding"
+		expect_status 200
+		[ "$(header content-encoding)" = zstd ] || fail "a coding that $coding allows"
+		etag=$(header etag)
+	done
+	req GET "/v1/jobs/$job/volumes/final" -r 301-1099 -H 'Accept-Encoding: zstd' -H "If-Range: $etag"
+	expect_status 200
+	cmp "$work/v.nii" "$body" || fail "all of the plain bytes for the tag of the compressed ones"
 	req GET "/v1/jobs/$job/volumes/final?format=jpeg"
 	expect_problem 400
 	req GET "/v1/jobs/$job/volumes/final?type=float16"

@@ -144,6 +144,22 @@ test_parameters_and_encodings_are_those_of_the_download() {
 	done
 }
 
+# A part's digest says which bytes a download has: also where they are compressed by several threads.
+test_compressed_parts_are_the_bytes_of_the_download() {
+	local query
+	uploaded_scan
+	# 8 MiB: some pieces of what a thread compresses at a time
+	post_job '{"scan": "SCAN", "grid": {"size": [128, 128, 128], "spacing_mm": [1, 1, 1]}, "fdk": {}}'
+	wait_job succeeded
+	for query in format=shuffled format=nifti.gz "format=nifti.gz&type=int16" format=raw "type=int16" "scale=3"; do
+		stream "$work/all" "$query" -H 'Accept-Encoding: zstd'
+		split_parts "$work/all" "$work/parts"
+		req GET "/v1/jobs/$job/volumes/final?$query" -H 'Accept-Encoding: zstd'
+		expect_status 200
+		cmp "$work/parts/0.body" "$body" || fail "the part's bytes with $query"
+	done
+}
+
 test_a_volume_comes_while_the_job_runs_and_a_lost_reader_leaves_nothing_open() {
 	local before i pids=()
 	uploaded_scan
