@@ -1,8 +1,8 @@
 #!/usr/bin/env bash
-# Every test: the house's rules, the unit tests and the black-box tests over HTTP, JOBS parts at a time: three more than
-# there are processors, since most of those over HTTP wait four fifths of their time. Unit suites compute, so that they
-# have one place for each processor; when there is none left, others have five places for each. What cannot run here is
-# skipped aloud. Closes with `N passed, N failed, N skipped`.
+# Every test: the house's rules, the unit tests and the black-box tests over HTTP, JOBS parts at a time: five for each
+# processor, since most of those over HTTP wait four fifths of their time. Unit suites compute: one for each processor,
+# and what waits for nothing goes behind what does (nice), so that they take the time that the others leave. What
+# cannot run here is skipped aloud. Closes with `N passed, N failed, N skipped`.
 # Usage: tests/run.sh [--soak] [FILTER ...]   only the parts whose path has one of the words in it; --soak: the long
 # tests of tests/soak in place of all others
 set -uo pipefail
@@ -11,26 +11,24 @@ export BUILD=${BUILD:-build}
 # Parts share the processors: threads that wait for others of theirs leave them to the rest, at once.
 export OMP_WAIT_POLICY=${OMP_WAIT_POLICY:-passive}
 processors=$(nproc)
-places_without_suites=${JOBS:-$((5 * processors))}
-JOBS=${JOBS:-$((processors + 3))}
 out=$BUILD/test/parts
 rm -rf "$BUILD"/test/{exchanges,reported.*,parts}
 mkdir -p "$out"
 results=$BUILD/test/results
 : >"$results"
 
-# Parts take from a second to nine minutes. Suites begin as soon as there is a place for one, since more of the others
-# run at a time when none is left; of both, those that take longest begin first, so that none of them is left alone on
-# one processor at the end.
+# Parts take from a second to seven minutes. Of suites and of the others those that take longest begin first, so that
+# none of them is left alone on one processor at the end.
 if [ "${1:-}" = --soak ]; then
 	shift
 	parts=(tests/soak/test_*.sh)
-	places_without_suites=$JOBS
+	JOBS=${JOBS:-$((processors + 3))}
 else
+	JOBS=${JOBS:-$((5 * processors))}
 	parts=(unit/recon unit/study unit/exterior unit/outofcore unit/metal unit/algorithm unit/stuck unit/detector unit/noise
 		unit/backend)
-	begin_with=(fleet devices_of_a_job restart page postgresql empty_views job faulty_device refine real damage arriving
-		scatter supervise memory dimse send patient dicom rings phantom events)
+	begin_with=(fleet restart devices_of_a_job page real postgresql phantom refine scatter fleet_network supervise
+		arriving metal job damage dimse send dicom demo faulty_device empty_views patient rings import events memory)
 	rest=$("$BUILD/unit" --list | sed 's,^,unit/,') || exit 1
 	for part in "${begin_with[@]}"; do rest+=" tests/http/test_$part.sh tests/web/test_$part.sh"; done
 	for part in $rest tests/http/test_*.sh tests/web/test_*.sh lint; do
@@ -70,7 +68,7 @@ unit_suite() { # NAME
 		echo "skip unit suite $1: too slow under a sanitizer" >>"$RESULTS"
 		return
 	fi
-	CK_LOG_FILE_NAME=$out/unit.$1.check "$BUILD/unit" "$1" 2>&1 | tee "$log"
+	CK_LOG_FILE_NAME=$out/unit.$1.check CK_TIMEOUT_MULTIPLIER=5 nice -n 10 "$BUILD/unit" "$1" 2>&1 | tee "$log"
 	status=${PIPESTATUS[0]}
 	# check's closing line: "100%: Checks: 42, Failures: 0, Errors: 0"
 	counts=$(grep -oE 'Checks: [0-9]+, Failures: [0-9]+, Errors: [0-9]+' "$log" | tail -1)
@@ -138,10 +136,9 @@ for part in "${parts[@]}"; do
 	{ [ "$part" = lint ] || [[ $part == unit/* ]] || [ -e "$part" ]; } && wanted "$part" "$@" && waiting+=("$part")
 done
 next_part() { # into part: the first that may begin; 1 where none may
-	local i suites=0 places=$JOBS
+	local i suites=0
+	[ ${#running[@]} -lt "$JOBS" ] || return 1
 	for part in "${running[@]}"; do [[ $part == unit/* ]] && suites=$((suites + 1)); done
-	[[ $suites != 0 || " ${waiting[*]}" == *" unit/"* ]] || places=$places_without_suites
-	[ ${#running[@]} -lt "$places" ] || return 1
 	for i in "${!waiting[@]}"; do
 		part=${waiting[i]}
 		[[ $part == unit/* && $suites -ge $processors ]] && continue
