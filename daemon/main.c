@@ -398,6 +398,8 @@ static int run(const struct arguments *arguments)
 	if (code == 0)
 		code = start_parts(config, &api, &err);
 	if (code == 0)
+		store_started(api.store);
+	if (code == 0)
 		code = start_feeder(&api, &feeder, &err);
 	if (code != 0)
 		log_line(LEVEL_ERROR, "cbctd cannot start: %s", err.text);

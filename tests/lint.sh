@@ -31,7 +31,7 @@ rule "nothing includes daemon but daemon and its tests" '#include "daemon/' $(fi
 rule "the daemon never touches CUDA" '#include [<"](cuda|cufft|kernels/)' $(files daemon)
 rule "libmicrohttpd stays in daemon/http" '#include <microhttpd' $(files daemon | grep -v '^daemon/http/')
 rule "SQLite stays in daemon/store/sqlite.c and the files beneath it" '#include [<"](sqlite3|daemon/store/checksum_vfs)' \
-	$(files daemon core proto clients | grep -vE '^daemon/store/(sqlite|checksum_vfs)\.[ch]$')
+	$(files daemon core proto clients | grep -vE '^daemon/store/(sqlite|checksum_vfs|log_index)\.[ch]$')
 rule "PostgreSQL stays in daemon/store/postgresql*" '#include [<"](libpq|daemon/store/postgresql)' \
 	$(files daemon core proto clients | grep -vE '^daemon/store/postgresql(_[a-z]+)?\.[ch]$')
 rule "a database knows no table of the catalogue" '#include "daemon/store/(catalogue|tables|store|internal)' \

@@ -209,9 +209,9 @@ static bool is_left_out(const char *path)
 {
 	const char *name = strrchr(path, '/') != NULL ? strrchr(path, '/') + 1 : path;
 
-	return strcmp(path, "lock") == 0 || strcmp(path, "reserve") == 0 || strcmp(path, "restored") == 0 ||
-	       strncmp(path, "catalogue.", strlen("catalogue.")) == 0 || strstr(name, ".tmp") != NULL ||
-	       strcmp(path, MANIFEST) == 0 || strcmp(path, DIGEST) == 0;
+	return strcmp(path, "lock") == 0 || strcmp(path, "reserve") == 0 || strcmp(path, "reserve-start") == 0 ||
+	       strcmp(path, "restored") == 0 || strncmp(path, "catalogue.", strlen("catalogue.")) == 0 ||
+	       strstr(name, ".tmp") != NULL || strcmp(path, MANIFEST) == 0 || strcmp(path, DIGEST) == 0;
 }
 
 /* Records before lists, lists before samples, whatever else first. */

@@ -50,7 +50,10 @@ static int reply_ready(struct request *request, const struct api *api, struct er
 	else
 		snprintf(quarantine, sizeof(quarantine), "quarantine: %d set aside, see /v1/quarantine\n", count);
 	write_troubles(api, "fleet: ", fleet, sizeof(fleet));
-	snprintf(text, sizeof(text), "ready\n%s%s%s", quarantine,
+	snprintf(text, sizeof(text), "ready\n%s%s%s%s", quarantine,
+		 store_reserve_whole(api->store)
+		     ? ""
+		     : "disk: it is full, nothing new can be stored until something is removed\n",
 		 http_audit_fails(api->http) ? "audit: it cannot be written, lines are lost, see the log\n" : "",
 		 fleet);
 	return reply_word(request, text, err);

@@ -335,8 +335,10 @@ static void review_holds(struct supervise *supervise)
 		return;
 	store_space(jobs_store(supervise->jobs), &available, &ignored);
 	supervise->review_at = jobs_review_holds(supervise->jobs, now, available) ? now + LOOK : 0;
-	if (supervise->review_at > 0)
-		store_reserve_save(jobs_store(supervise->jobs));
+	if (store_reserve_whole(jobs_store(supervise->jobs)))
+		return;
+	store_reserve_save(jobs_store(supervise->jobs));
+	supervise->review_at = now + LOOK;
 }
 
 static void move_jobs(struct supervise *supervise)

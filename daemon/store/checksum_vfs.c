@@ -19,6 +19,7 @@
 #include "daemon/lock.h"
 #include "daemon/log.h"
 #include "daemon/store/log_extent.h"
+#include "daemon/store/log_index.h"
 #include "proto/scan_directory.h"
 #include "proto/sums.h"
 
@@ -39,7 +40,8 @@ struct pages {
 	pthread_mutex_t lock;
 	uint64_t *frames; /* [space], guarded by lock: checksum of the page of each frame of the log, with KNOWN */
 	size_t space;     /* guarded by lock */
-	struct log_extent extent; /* guarded by lock */
+	struct log_extent extent; /* guarded by lock, as the next */
+	struct log_index index;
 };
 static const uint64_t KNOWN = 1ull << 32;
 
@@ -48,6 +50,7 @@ struct page_file {
 	sqlite3_file file;
 	struct pages *pages;
 	enum kind kind;
+	struct log_index_use use;
 };
 
 static sqlite3_file *base_of(sqlite3_file *file)
@@ -274,22 +277,41 @@ static int file_device(sqlite3_file *file)
 
 static int file_shm_map(sqlite3_file *file, int page, int size, int extend, void volatile **ret)
 {
-	return base_of(file)->pMethods->xShmMap(base_of(file), page, size, extend, ret);
+	struct page_file *paged = (struct page_file *)(void *)file;
+	int result;
+
+	pthread_mutex_lock(&paged->pages->lock);
+	result = log_index_map(&paged->pages->index, &paged->use, page, size, extend != 0, ret);
+	pthread_mutex_unlock(&paged->pages->lock);
+	return result;
 }
 
 static int file_shm_lock(sqlite3_file *file, int offset, int count, int flags)
 {
-	return base_of(file)->pMethods->xShmLock(base_of(file), offset, count, flags);
+	struct page_file *paged = (struct page_file *)(void *)file;
+	int result;
+
+	pthread_mutex_lock(&paged->pages->lock);
+	result = log_index_lock(&paged->pages->index, &paged->use, offset, count, flags);
+	pthread_mutex_unlock(&paged->pages->lock);
+	return result;
 }
 
 static void file_shm_barrier(sqlite3_file *file)
 {
-	base_of(file)->pMethods->xShmBarrier(base_of(file));
+	(void)file;
+	log_index_barrier();
 }
 
 static int file_shm_unmap(sqlite3_file *file, int remove)
 {
-	return base_of(file)->pMethods->xShmUnmap(base_of(file), remove);
+	struct page_file *paged = (struct page_file *)(void *)file;
+
+	(void)remove;
+	pthread_mutex_lock(&paged->pages->lock);
+	log_index_leave(&paged->pages->index, &paged->use);
+	pthread_mutex_unlock(&paged->pages->lock);
+	return SQLITE_OK;
 }
 
 /* Version 2: no mapped reads, which nobody would check. */
@@ -320,6 +342,7 @@ static int vfs_open(sqlite3_vfs *vfs, const char *name, sqlite3_file *file, int 
 	int result = pages->base->xOpen(pages->base, name, base_of(file), flags, ret_flags);
 
 	paged->pages = pages;
+	paged->use = (struct log_index_use){.in_use = false};
 	paged->kind = flags & SQLITE_OPEN_MAIN_DB ? KIND_DATABASE : flags & SQLITE_OPEN_WAL ? KIND_LOG : KIND_OTHER;
 	paged->file.pMethods = result == SQLITE_OK ? &methods : NULL;
 	if (result == SQLITE_OK && paged->kind == KIND_LOG)

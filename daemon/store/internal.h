@@ -46,8 +46,10 @@ struct store {
 	} * undone;
 	int undone_count;
 	bool opened;
-	bool interrupted;    /* the process before did not end as it should */
-	_Atomic bool failed; /* a commit did not reach the disk: nothing is acknowledged any more */
+	unsigned long long start_room; /* bytes that were given up for this start; constant after it */
+	_Atomic bool started;          /* the room that a start may need is set aside for the next one */
+	bool interrupted;              /* the process before did not end as it should */
+	_Atomic bool failed;           /* a commit did not reach the disk: nothing is acknowledged any more */
 	atomic_flag failure_logged;
 	_Atomic long long last_event;
 

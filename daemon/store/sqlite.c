@@ -6,8 +6,8 @@
  * that no commit waits for most of that. One connection writes, another reads and never waits for the writer. Every
  * page is checked as it is read (store/checksum_vfs.h).
  *
- * The catalogue is this process's own: the index of its log (-shm) is mapped memory that nothing checks, so its file
- * loses its name as soon as it is open. Another program must not write into the catalogue of a running daemon.
+ * The catalogue is this process's own, and so is the index of its log (store/log_index.h). Another program must not
+ * write into the catalogue of a running daemon.
  */
 #include <assert.h>
 #include <errno.h>
@@ -85,10 +85,9 @@ static bool says_damaged(sqlite3 *db, int result)
 static int connection_error(struct connection *connection, int result, const char *what, struct error *err)
 {
 	int cause = sqlite3_system_errno(connection->db);
-	bool full =
-	    result == SQLITE_FULL ||
-	    (result == SQLITE_IOERR && sqlite3_extended_errcode(connection->db) != SQLITE_IOERR_FSYNC &&
-	     (cause == ENOSPC || cause == EDQUOT || sqlite3_extended_errcode(connection->db) == SQLITE_IOERR_SHMSIZE));
+	bool full = result == SQLITE_FULL ||
+		    (result == SQLITE_IOERR && sqlite3_extended_errcode(connection->db) != SQLITE_IOERR_FSYNC &&
+		     (cause == ENOSPC || cause == EDQUOT));
 	char text[200];
 
 	snprintf(text, sizeof(text), "%.60s: %.120s", what, sqlite3_errmsg(connection->db));
@@ -448,12 +447,11 @@ static int convert(const struct catalogue_site *site, struct error *err)
 	if (result == SQLITE_OK)
 		result = sqlite3_exec(db, sql, NULL, NULL, NULL);
 	if (result != SQLITE_OK)
-		code = error_set(err, ERR_IO, "the catalogue cannot be converted: %s", sqlite3_errmsg(db));
+		code = error_set(err, (result & 0xff) == SQLITE_FULL ? ERR_NO_SPACE : ERR_IO,
+				 "the catalogue cannot be converted: %s", sqlite3_errmsg(db));
 	sqlite3_close(db);
-	if (code == 0)
-		code = pages_seal(copy, err);
-	if (code != 0)
-		return code;
+	if (code != 0 || pages_seal(copy, err) != 0)
+		return err->code;
 	if (rename(copy, path) != 0)
 		return error_set_errno(err, errno, "rename %s", copy);
 	/* The copy has all of the log, which must not be applied to it again. */
@@ -483,10 +481,10 @@ static int look_at_files(const struct catalogue_site *site, enum pages_kind *ret
 	return code;
 }
 
-/* What could not be opened, or not be checked for want of memory, is not known to be damaged. */
+/* What could not be opened, or not be checked or converted for want of memory or room, is not known to be damaged. */
 static int note_damage(struct catalogue_site *site, int code)
 {
-	if (code != 0 && code != ERR_BUSY && code != ERR_NO_MEMORY)
+	if (code != 0 && code != ERR_BUSY && code != ERR_NO_MEMORY && code != ERR_NO_SPACE)
 		atomic_store(&site->damaged, true);
 	return code;
 }
@@ -580,7 +578,6 @@ static int check_structure(struct database *database, struct error *err)
 
 static int open_connections(struct database *database, struct error *err)
 {
-	char path[1024];
 	int code = make_private(database->site, err);
 
 	if (code == 0)
@@ -591,9 +588,6 @@ static int open_connections(struct database *database, struct error *err)
 		code = check_structure(database, err);
 	if (code == 0)
 		code = connection_open(&database->connections[SESSION_READER], err);
-	/* Connections of this process find it by the catalogue's inode. */
-	catalogue_path(database->site, "-shm", path);
-	unlink(path);
 	return code;
 }
 

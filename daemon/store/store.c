@@ -65,6 +65,118 @@ static int take_directory(struct store *store, struct error *err)
 	return deleted_open(store->directory, &store->deleted, err);
 }
 
+/* ---- room set aside ---- */
+
+int store_space(const struct store *store, unsigned long long *ret_bytes, struct error *err)
+{
+	return space_free(store->directory, ret_bytes, err);
+}
+
+/*
+ * What a start needs on a disk that has nothing left: the index of the catalogue's log, records of jobs that a crash
+ * has cut off, and at best room for the log in the catalogue, which is then less than the log. A small disk, or one
+ * that is nearly full, keeps most of itself.
+ */
+static const struct reserve {
+	const char *name;
+	unsigned long long most; /* bytes */
+} start_reserve = {"reserve-start", 1ull << 20}, removal_reserve = {"reserve", 8ull << 20};
+static const unsigned long long reserve_least = 256ull << 10, reserve_part = 16; /* bytes; of what is free */
+
+static void reserve_path(const struct store *store, const struct reserve *reserve, char ret_path[1024])
+{
+	snprintf(ret_path, 1024, "%s/%s", store->directory, reserve->name);
+}
+
+static unsigned long long reserve_size(const struct store *store, const struct reserve *reserve)
+{
+	struct stat status;
+	char path[1024];
+
+	reserve_path(store, reserve, path);
+	return stat(path, &status) == 0 ? (unsigned long long)status.st_size : 0;
+}
+
+static bool reserve_spend(const struct store *store, const struct reserve *reserve, const char *what)
+{
+	char path[1024];
+
+	reserve_path(store, reserve, path);
+	if (unlink(path) != 0)
+		return false;
+	log_line(LEVEL_WARNING, "the disk is full: the room set aside for %s is used now", what);
+	return true;
+}
+
+bool store_reserve_spend(const struct store *store)
+{
+	return reserve_spend(store, &removal_reserve, "removals");
+}
+
+/* Grows only: what others have freed since. least: bytes that it takes of what is free in any case. */
+static void reserve_save(const struct store *store, const struct reserve *reserve, unsigned long long least)
+{
+	unsigned long long available, bytes, size = reserve_size(store, reserve);
+	char path[1024];
+	struct error err;
+	int file, failed = -1;
+
+	/* Nothing is made in another directory that stands in the place of ours. */
+	if (store_check_directory(store, &err) != 0 || store_space(store, &available, &err) != 0)
+		return;
+	available += size;
+	bytes = available / reserve_part < reserve->most ? available / reserve_part : reserve->most;
+	if (bytes < reserve_least)
+		bytes = available / 2 < reserve_least ? available / 2 : reserve_least;
+	if (bytes < least)
+		bytes = available < least ? available : least;
+	if (size >= bytes)
+		return;
+	reserve_path(store, reserve, path);
+	file = open(path, O_WRONLY | O_CREAT | O_CLOEXEC, 0600);
+	if (file < 0)
+		return;
+	/* Blocks of the file system's own are no less: what is free is more than what one file can get. */
+	for (; failed != 0 && bytes > size && bytes >= reserve_least / 4; bytes -= bytes / 4)
+		failed = posix_fallocate(file, 0, (off_t)bytes);
+	if (failed != 0 && size == 0)
+		unlink(path);
+	close(file);
+}
+
+void store_reserve_save(const struct store *store)
+{
+	if (store->started) {
+		/* All that the start has left of what it was given, or each start would have less. */
+		reserve_save(store, &start_reserve, store->start_room);
+		reserve_save(store, &removal_reserve, 0);
+	}
+}
+
+bool store_reserve_whole(const struct store *store)
+{
+	return reserve_size(store, &start_reserve) >= reserve_least &&
+	       reserve_size(store, &removal_reserve) >= reserve_least;
+}
+
+void store_started(struct store *store)
+{
+	store->started = true;
+	store_reserve_save(store);
+}
+
+static void make_room_to_start(struct store *store)
+{
+	unsigned long long available, size = reserve_size(store, &start_reserve);
+	struct error err;
+
+	if (store_space(store, &available, &err) == 0 && available < start_reserve.most &&
+	    reserve_spend(store, &start_reserve, "the start"))
+		store->start_room = size;
+}
+
+/* ---- opening ---- */
+
 static int load(struct store *store, struct error *err)
 {
 	bool fresh = false;
@@ -101,6 +213,8 @@ static int open_catalogue(struct store *store, bool rebuild, struct error *err)
 	char why[QUARANTINE_WHY_MAX];
 	int code = take_directory(store, err);
 
+	if (code == 0)
+		make_room_to_start(store);
 	if (code == 0 && rebuild)
 		code = set_catalogue_aside(store, "it is made again as asked", err);
 	if (code == 0 && rebuild)
@@ -108,7 +222,7 @@ static int open_catalogue(struct store *store, bool rebuild, struct error *err)
 	if (code != 0)
 		return code;
 	code = load(store, err);
-	/* The start itself writes little: the index of the log, records that follow. */
+	/* A catalogue that is made again is larger than what a start usually writes. */
 	if (code == ERR_NO_SPACE && store_reserve_spend(store)) {
 		unload(store);
 		code = load(store, err);
@@ -188,7 +302,6 @@ static int open_store(const char *directory, const struct store_options *hooks, 
 		store_close(store);
 		return code;
 	}
-	store_reserve_save(store);
 	*ret_store = store;
 	return 0;
 }
@@ -256,55 +369,6 @@ void store_distrust(struct store *store, const struct error *err)
 		store_fail(store, err->text);
 }
 
-static void reserve_path(const struct store *store, char ret_path[1024])
-{
-	snprintf(ret_path, 1024, "%s/reserve", store->directory);
-}
-
-int store_space(const struct store *store, unsigned long long *ret_bytes, struct error *err)
-{
-	return space_free(store->directory, ret_bytes, err);
-}
-
-bool store_reserve_spend(const struct store *store)
-{
-	char path[1024];
-
-	reserve_path(store, path);
-	if (unlink(path) != 0)
-		return false;
-	log_line(LEVEL_WARNING, "the disk is full: the room set aside for removals is used now");
-	return true;
-}
-
-/*
- * A small disk, or one that is nearly full, keeps most of itself; the reserve grows when there is more. It should be
- * enough for the next start, which needs about `least`.
- */
-void store_reserve_save(const struct store *store)
-{
-	const unsigned long long most = 8ull << 20, least = 256ull << 10, part = 16;
-	unsigned long long available, bytes;
-	struct stat status;
-	char path[1024];
-	struct error err;
-	int file;
-
-	if (store_space(store, &available, &err) != 0)
-		return;
-	bytes = available / part < most ? available / part : most;
-	if (bytes < least)
-		bytes = available / 2 < least ? available / 2 : least;
-	reserve_path(store, path);
-	file = open(path, O_WRONLY | O_CREAT | O_CLOEXEC, 0600);
-	if (file < 0)
-		return;
-	if (fstat(file, &status) == 0 && (unsigned long long)status.st_size < bytes &&
-	    posix_fallocate(file, 0, (off_t)bytes) != 0)
-		unlink(path);
-	close(file);
-}
-
 void store_close(struct store *store)
 {
 	if (store == NULL)
@@ -312,6 +376,8 @@ void store_close(struct store *store)
 	store_stop_checker(store);
 	store_free_scans(store);
 	catalogue_free(store->catalogue);
+	if (store->opened)
+		store_started(store); /* of a start that came no further, too: the next one needs it */
 	deleted_free(store->deleted);
 	watch_list_destroy(&store->arrivals);
 	verified_free(store->verified);

@@ -19,6 +19,7 @@
  *
  *   STATE/lock              held by the one daemon that uses STATE
  *   STATE/reserve           room for the commits that empty a full disk
+ *   STATE/reserve-start     room for the next start on a full disk
  *   STATE/deleted           ids that clients have deleted (store/deleted.h)
  *   STATE/calibrations/     of another room (daemon/calibrations/calibrations.h)
  *   STATE/quarantine/       files that were found and belong nowhere (store/quarantine.h)
@@ -78,11 +79,15 @@ void store_distrust(struct store *store, const struct error *err);
 
 /*
  * A full disk can be emptied: a few MiB are set aside in STATE/reserve for the commits that a removal needs. Spending
- * gives them back to the file system; false when they are spent already. store_reserve_save makes it anew as soon as
- * there is room for it again.
+ * gives them back to the file system; false when they are spent already. Another room is the next start's alone:
+ * store_open gives it up on a full disk, and all that opens behind it may use it until store_started.
+ * store_reserve_save makes both anew as soon as there is room for them again; store_reserve_whole tells whether each
+ * has what it needs. Any thread.
  */
 bool store_reserve_spend(const struct store *store);
 void store_reserve_save(const struct store *store);
+bool store_reserve_whole(const struct store *store);
+void store_started(struct store *store);
 /* Bytes that the file system of STATE has free. */
 int store_space(const struct store *store, unsigned long long *ret_bytes, struct error *err);
 

@@ -379,7 +379,7 @@ def vanished(before, state, damaged, kind, stopped):
 # ---- damage ----
 
 def damage(choose, state):
-    files = sorted(path for path in Path(state).rglob("*") if path.is_file() and path.name not in ("lock", "reserve"))
+    files = sorted(path for path in Path(state).rglob("*") if path.is_file() and path.name not in ("lock", "reserve", "reserve-start"))
     path = choose.choice(files)
     size = path.stat().st_size
     kind = choose.choice(["flip", "flip", "truncate", "delete"]) if size > 0 else "delete"

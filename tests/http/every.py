@@ -47,7 +47,7 @@ SCAN = {
 JOB = {"grid": {"size": [16, 16, 8], "spacing_mm": [4, 4, 6]}, "fdk": {},
        "sart": {"iterations": 2, "subsets": 2}, "emit": ["fdk"]}
 FILES = ["catalogue.sqlite", "catalogue.sqlite-synced", "deleted", "jobs/ID/fdk.nii", "jobs/ID/final.nii",
-         "jobs/ID/record.json", "lock", "reserve", "scans/ID/projections.raw", "scans/ID/projections.sums",
+         "jobs/ID/record.json", "lock", "reserve", "reserve-start", "scans/ID/projections.raw", "scans/ID/projections.sums",
          "scans/ID/record.json", "scans/ID/scan.json"]  # of the reference; an empty catalogue is set aside with a note
 SET_ASIDE = "quarantine/catalogue.sqlite."
 SHAPES: Dict[str, object] = {}  # of the documents in the reference run

@@ -209,6 +209,64 @@ test_a_start_on_a_full_disk() {
 	stop_daemon
 }
 
+# Removals have used the room that was set aside for them, and whatever is free is taken at once by others.
+test_starts_on_a_full_disk_again_and_again() {
+	local round scans=() waiting running
+	fill() { cat /dev/zero >"$disk/fill.$1" 2>/dev/null || true; }
+	small_disk 16m
+	for round in 1 2 3; do
+		post_scan "$scan_dir"
+		post_projections "$scan_dir"
+		scans+=("$scan")
+	done
+	post_job "{\"scan\": \"SCAN\", $small, \"fdk\": {}, \"sart\": {\"iterations\": 100000, \"subsets\": \"views\"}, \"emit\": [\"fdk\"]}"
+	running=$job
+	state_becomes running
+	post_scan "$scan_dir"
+	post_job "{\"scan\": \"SCAN\", $small, \"fdk\": {}}"
+	waiting=$job
+	for round in KILL KILL TERM KILL; do
+		rm -f "$disk/state/reserve"
+		fill "$round.$RANDOM"
+		stop_daemon $round
+		fill "after.$RANDOM"
+		[ "$(df --output=avail "$disk" | tail -1)" -eq 0 ] || fail "a full disk"
+		state=$disk/state start_daemon
+		req GET /v1/scans
+		expect_json '.scans | length == 4'
+		req GET "/v1/scans/${scans[0]}/projections/3?format=raw"
+		expect_status 200
+		cmp "$body" <(dd if="$scan_dir/projections.raw" bs=$((64 * 48 * 4)) skip=3 count=1 status=none) || fail "projection 3"
+		req GET "/v1/jobs/$running"
+		expect_json '.state == "running" or .state == "queued"'
+	done
+	fill now
+	req GET /readyz
+	expect_status 200
+	grep -q '^disk: it is full' "$body" || fail "a word of the full disk, got $(cat "$body")"
+	req PUT "/v1/scans/$scan/projections" -T "$scan_dir/projections.raw"
+	expect_problem 507
+	header Retry-After | grep -qE '^[0-9]+$' || fail "Retry-After of a full disk"
+	# It goes on by itself as soon as a client has made room.
+	for round in 0 1; do
+		req DELETE "/v1/scans/${scans[$round]}"
+		expect_status 204
+	done
+	req DELETE "/v1/jobs/$running?wait=20"
+	expect_json '.state == "cancelled"'
+	req DELETE "/v1/jobs/$running"
+	expect_status 204
+	post_projections "$scan_dir"
+	job=$waiting
+	wait_job succeeded
+	for round in reserve reserve-start; do
+		[ -s "$disk/state/$round" ] || fail "room set aside again: $round"
+	done
+	req GET /readyz
+	[ "$(cat "$body")" = ready ] || fail "nothing of a full disk, got $(cat "$body")"
+	stop_daemon
+}
+
 test_a_moment_without_descriptors_or_with_a_slow_disk_ends_no_job() {
 	faulty_daemon
 	post_scan "$scan_dir"
