@@ -16,15 +16,15 @@ static const double patience = 15;        /* s; with one heartbeat more, a clien
 static const char heartbeat_text[] = ":\n\n", greeting[] = "retry: 2000\n\n";
 
 /*
- * To send one event to one watcher takes some 7 us of a processor, most of it in
+ * To send one event to one watcher takes some 12 us of a processor, most of it in
  * the kernel's send. A crowd is sent at once what happened within that many
  * times a moment, so that however fast a job is, a thousand watchers take a
- * tenth of one processor from it, and are sent within a tenth of a second.
+ * tenth of one processor from it, and are sent within an eighth of a second.
  * Events that were put off are sent to all in the same instant, of a grid of a few: each
  * thread then works through its share without a sleep between, and beside the
  * others.
  */
-static const double moment = 80e-6, moments_most = 70e-3, instant = 10e-3; /* s */
+static const double moment = 120e-6, moments_most = 120e-3, instant = 10e-3; /* s */
 
 struct watcher {
 	struct http *http;
