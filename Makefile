@@ -26,6 +26,7 @@ endif
 endif
 # Machine code for these cards, and PTX for later ones. CUDA_ARCH=90 for a quick build.
 CUDA_ARCH ?= 75 80 86 89 90 100 120
+CUDA_PTX ?= $(lastword $(CUDA_ARCH))
 SANITIZE ?=
 SANITIZED ?= 0
 # 1 in CI and for developers; a newer compiler's new warning breaks nobody else's build.
@@ -108,7 +109,7 @@ cuda_objects := $(patsubst %.cu,$(BUILD)/%.o,$(wildcard kernels/*.cu))
 cuda_seed     = $(if $(cuda_seeded),-frandom-seed=$<)
 cuda_seeded  := $(shell $(NVCC) --help | grep -o -m1 frandom-seed)
 cuda_code    := $(foreach a,$(CUDA_ARCH),-gencode arch=compute_$(a),code=sm_$(a)) \
-                -gencode arch=compute_$(lastword $(CUDA_ARCH)),code=compute_$(lastword $(CUDA_ARCH))
+                $(foreach a,$(CUDA_PTX),-gencode arch=compute_$(a),code=compute_$(a))
 endif
 
 programs := $(BUILD)/cbctd $(BUILD)/cbct-worker $(BUILD)/cbct-dicom $(BUILD)/cbct $(if $(cuda_objects),$(BUILD)/cbct-cuda)
@@ -284,7 +285,9 @@ $(BUILD)/gpu_ceilings: tests/bench/gpu_ceilings.cu
 apt_install = { $$run apt-get install -y -qq --no-install-recommends $(1) >/dev/null 2>&1 || \
 	  { $$run apt-get update -qq && DEBIAN_FRONTEND=noninteractive $$run apt-get install -y -qq --no-install-recommends $(1) >/dev/null; }; }
 
+# Of commands or files, and of Python's modules.
 install_optional = wanted=""; for pair in $(1); do command -v $${pair%%:*} >/dev/null 2>&1 || [ -e $${pair%%:*} ] || wanted="$$wanted $${pair\#\#*:}"; done; \
+	for pair in $(2); do $(PYTHON) -c "import $${pair%%:*}" 2>/dev/null || wanted="$$wanted $${pair\#\#*:}"; done; \
 	[ -z "$$wanted" ] && exit 0; \
 	run=""; [ "$$(id -u)" = 0 ] || run="sudo -n"; \
 	echo "installing:$$wanted"; \
@@ -293,7 +296,7 @@ install_optional = wanted=""; for pair in $(1); do command -v $${pair%%:*} >/dev
 check: OPTIONAL += pg_config:libpq-dev g++:g++ /usr/include/dcmtk/dcmnet/scu.h:libdcmtk-dev
 # What tests alone need comes while the programs are compiled.
 for_tests := pg_ctlcluster:postgresql ip:iproute2 chromium:chromium dciodvfy:dicom3tools Orthanc:orthanc-dicomweb /usr/share/orthanc/plugins/libOrthancWebViewer.so:orthanc-webviewer promtool:prometheus systemd-analyze:systemd
-check: MODULES += matplotlib:python3-matplotlib nibabel:python3-nibabel pydicom:python3-pydicom gdcm:python3-gdcm h5py:python3-h5py olefile:python3-olefile odil:python3-odil
+modules_for_tests := matplotlib:python3-matplotlib nibabel:python3-nibabel pydicom:python3-pydicom gdcm:python3-gdcm h5py:python3-h5py olefile:python3-olefile odil:python3-odil
 setup: ## install the Debian packages that are missing
 	@missing=""; \
 	for pair in $(COMMANDS); do command -v $${pair%%:*} >/dev/null 2>&1 || missing="$$missing $${pair##*:}"; done; \
@@ -308,14 +311,15 @@ setup: ## install the Debian packages that are missing
 	@$(call install_optional,$(OPTIONAL))
 
 for-tests:
-	@$(call install_optional,$(for_tests))
+	@$(call install_optional,$(for_tests),$(modules_for_tests))
 
 demo: setup ## a C-arm scan posted with curl, reconstructed, its volumes coming back
 	@$(MAKE) --no-print-directory -j$$(nproc) all
 	@BUILD=$(BUILD) clients/curl/demo.sh
 
+# What takes longest to compile begins first, so that nothing waits for it alone at the end.
 check: setup ## every test; what cannot run here is skipped aloud
-	@$(MAKE) --no-print-directory -j$$(($$(nproc) + 1)) for-tests all test-programs
+	@$(MAKE) --no-print-directory -j$$(($$(nproc) + 1)) for-tests $(filter %/project.o,$(cuda_objects)) all test-programs
 	@BUILD=$(BUILD) SANITIZED=$(SANITIZED) LEAVE_OUT="$(LEAVE_OUT)" tests/run.sh
 
 soak: setup ## the long tests: faults by the thousand, sweeps over anatomy and noise (an hour and more)
