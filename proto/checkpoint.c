@@ -67,6 +67,7 @@ int history_add(struct history *history, const struct history_row *row, struct e
 		history->room = room;
 	}
 	history->rows[history->count++] = *row;
+	history->seconds += row->seconds;
 	return 0;
 }
 
@@ -75,6 +76,7 @@ static int read_history(const char *bytes, int count, struct history *history, s
 	int code = 0;
 
 	history->count = 0;
+	history->seconds = 0;
 	for (int i = 0; i < count && code == 0; i++) {
 		struct history_row row;
 
@@ -307,9 +309,16 @@ void checkpointer_discard(struct checkpointer *checkpointer)
 	saver_discard(checkpointer->saver);
 }
 
-bool checkpointer_due(const struct checkpointer *checkpointer)
+/* So many seconds before the run's end. */
+static bool comes_too_late(const struct checkpointer *checkpointer, double left)
 {
-	return !saver_busy(checkpointer->saver) && clock_monotonic() >= checkpointer->due;
+	return left < saver_seconds(checkpointer->saver);
+}
+
+bool checkpointer_due(const struct checkpointer *checkpointer, double left)
+{
+	return !saver_busy(checkpointer->saver) && clock_monotonic() >= checkpointer->due &&
+	       !comes_too_late(checkpointer, left);
 }
 
 /* Beside the checkpoint, the disk must keep room for a volume of the job, and for the daemon's records. */
@@ -323,12 +332,15 @@ static bool has_room(const char *path, size_t bytes)
 	return statvfs(directory, &disk) != 0 || (double)disk.f_bavail * (double)disk.f_frsize >= 2 * (double)bytes;
 }
 
-void checkpointer_prepare(struct checkpointer *checkpointer, const struct recon *recon, const struct history *history)
+void checkpointer_prepare(struct checkpointer *checkpointer, const struct recon *recon, const struct history *history,
+			  double left)
 {
 	const size_t content = content_bytes(recon, history->count + ROWS_AHEAD);
+	const double until_due = fmax(checkpointer->due - clock_monotonic(), 0);
 
 	if (!checkpointer->ahead || checkpointer->prepared || saver_busy(checkpointer->saver) ||
-	    clock_monotonic() < checkpointer->due - SECONDS_AHEAD || !has_room(checkpointer->path, content))
+	    until_due > SECONDS_AHEAD || comes_too_late(checkpointer, left - until_due) ||
+	    !has_room(checkpointer->path, content))
 		return;
 	checkpointer->prepared = true;
 	saver_prepare(checkpointer->saver, checkpointer->blank, content);

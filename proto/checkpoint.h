@@ -21,6 +21,7 @@ enum { CHECKPOINT_FILE_OFFSET = 160 };
 struct history {
 	struct history_row *rows; /* owned; free it */
 	int count, room;
+	double seconds; /* of all rows */
 };
 int history_add(struct history *history, const struct history_row *row, struct error *err);
 
@@ -62,14 +63,17 @@ void checkpointer_discard(struct checkpointer *checkpointer);
 void checkpointer_free(struct checkpointer *checkpointer); /* waits for the disk; NULL is fine */
 /*
  * Whether the next checkpoint is due: so many seconds of work after the last, or later where the copies
- * would take more than a fiftieth of the time, and the last one is on the disk.
+ * would take more than a fiftieth of the time, and the last one is on the disk. left: seconds of work until the run's
+ * end, at most. One that would not be on the disk by then, as long as the last one took, is never due: nobody could go
+ * on from it, and the volume at the end would wait for the disk behind it.
  */
-bool checkpointer_due(const struct checkpointer *checkpointer);
+bool checkpointer_due(const struct checkpointer *checkpointer, double left);
 /*
  * Gets the next file's pages beside the work that goes on, where that is asked for and the checkpoint is due in a
  * second or less. For each iteration that leaves none; a hint.
  */
-void checkpointer_prepare(struct checkpointer *checkpointer, const struct recon *recon, const struct history *history);
+void checkpointer_prepare(struct checkpointer *checkpointer, const struct recon *recon, const struct history *history,
+			  double left);
 /*
  * Begins a checkpoint of the iterate as it is. A disk without room for it, and for a volume of the job beside it, is no
  * error: there is none then.

@@ -7,6 +7,7 @@
 #include <errno.h>
 #include <fcntl.h>
 #include <limits.h>
+#include <math.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
@@ -107,18 +108,28 @@ static int announce_checkpoint(struct run *run, bool wait, struct error *err)
 	return code;
 }
 
+/* Seconds that the iterations to come take if each takes as long as those so far; rules may end them sooner. */
+static double seconds_left(const struct run *run)
+{
+	const struct history *history = &run->history;
+	const int left = recipe_iterations(run->recipe) - recon_iteration(run->recon);
+
+	return history->count > 0 ? left * history->seconds / history->count : INFINITY;
+}
+
 /*
  * Behind an iteration that is not the last. The volumes that were announced are on the disk before a checkpoint is
  * begun: a run that goes on from it would not make them again.
  */
 static int keep_checkpoint(struct run *run, struct error *err)
 {
+	const double left = seconds_left(run);
 	int code = announce_checkpoint(run, false, err);
 
 	if (code != 0)
 		return code;
-	if (!checkpointer_due(run->checkpointer)) {
-		checkpointer_prepare(run->checkpointer, run->recon, &run->history);
+	if (!checkpointer_due(run->checkpointer, left)) {
+		checkpointer_prepare(run->checkpointer, run->recon, &run->history, left);
 		return 0;
 	}
 	code = settle(run, false, err);

@@ -20,6 +20,7 @@
 #include <unistd.h>
 
 #include "core/pulse.h"
+#include "proto/clock.h"
 #include "proto/durable.h"
 #include "proto/seal.h"
 
@@ -38,7 +39,8 @@ struct mapped {
 struct saver {
 	pthread_mutex_t lock; /* guards what follows */
 	pthread_cond_t changed;
-	size_t given; /* bytes of the file, its header included */
+	size_t given;            /* bytes of the file, its header included */
+	double begun, synced_at; /* clock_monotonic */
 	bool ended, abandoned, synced;
 	struct error trouble;
 	size_t taken; /* bytes of `blank` that the preparers have populated, or are about to */
@@ -51,6 +53,7 @@ struct saver {
 
 	/* The caller's own; while a file is under way its thread reads them. */
 	bool busy;
+	double seconds; /* that the last file took */
 	char path[PATH_MAX];
 	struct mapped file;
 	pthread_t syncer;
@@ -272,6 +275,7 @@ static void *sync_loop(void *context)
 	durable_settle(&saver->file.file, err.code == 0 ? &err : &ignored);
 	pthread_mutex_lock(&saver->lock);
 	saver->trouble = err;
+	saver->synced_at = clock_monotonic();
 	saver->synced = true;
 	pthread_cond_broadcast(&saver->changed);
 	pthread_mutex_unlock(&saver->lock);
@@ -335,6 +339,11 @@ void saver_free(struct saver *saver)
 	free(saver);
 }
 
+double saver_seconds(const struct saver *saver)
+{
+	return saver->seconds;
+}
+
 bool saver_busy(const struct saver *saver)
 {
 	return saver->busy;
@@ -376,6 +385,7 @@ int saver_begin(struct saver *saver, const char *path, const void *header, size_
 	if (code != 0)
 		return code;
 	saver->given = 0;
+	saver->begun = clock_monotonic();
 	code = saver_piece(saver, length, &place, err);
 	if (code == 0) {
 		memcpy(place, header, length);
@@ -465,6 +475,7 @@ int saver_finish(struct saver *saver, bool wait, bool *ret_done, struct error *e
 	pthread_join(saver->syncer, NULL);
 	unmap(&saver->file);
 	saver->busy = false;
+	saver->seconds = saver->synced_at - saver->begun;
 	if (saver->trouble.code != 0) {
 		unlink(saver->path);
 		*err = saver->trouble;

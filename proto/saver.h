@@ -45,6 +45,8 @@ int saver_end(struct saver *saver, struct error *err);
 
 /* Whether a file is under way, from saver_begin to a saver_finish that has said how it ended. */
 bool saver_busy(const struct saver *saver);
+/* From the beginning of the last file that reached the disk until it was there, s; 0: none has yet. */
+double saver_seconds(const struct saver *saver);
 /* How the file ended: what failed, and then it is removed. *ret_done false: not yet (never so with `wait`). */
 int saver_finish(struct saver *saver, bool wait, bool *ret_done, struct error *err);
 

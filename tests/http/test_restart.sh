@@ -281,6 +281,27 @@ told_and_held() {
 digest_of() { echo "sha-256=:$(openssl dgst -sha256 -binary "$1" | base64 -w 0):"; }
 events_of() { curl -sS -N --max-time 60 "$url/v1/jobs/$job/events" | awk '/^event: /{ printf "%s%s", sep, $2; sep = " " }'; }
 
+# The first checkpoint takes three times as long as the iterations that are left: no other would be on the disk in time.
+test_a_checkpoint_that_the_end_would_overtake_is_not_begun() {
+	local i
+	: >"$hold"
+	CBCT_TEST_HOLD=$hold start_daemon --worker "$BUILD/cbct-worker-held" --checkpoint-seconds 0.01
+	post_scan "$scan_dir"
+	post_projections "$scan_dir"
+	post_job "{\"scan\": \"SCAN\", $grid, \"fdk\": null, \"sart\": {\"iterations\": $((4 * long)), \"subsets\": 1}}"
+	for ((i = 0; i < 2400; i++)); do
+		req GET "/v1/jobs/$job"
+		[ "$(json '.iteration // 0')" -lt $((3 * long)) ] || break
+		sleep 0.05
+	done
+	expect_json '.state == "running"'
+	rm "$hold"
+	wait_job succeeded
+	req GET /metrics
+	[ "$(awk '$1 == "cbctd_checkpoints_total" { print $2 }' "$body")" = 1 ] || fail "one checkpoint, got $(grep '^cbctd_checkpoints_total' "$body")"
+	stop_daemon
+}
+
 test_a_volume_is_told_of_before_it_is_on_the_disk_and_the_job_ends_after() {
 	local list
 	told_and_held
