@@ -18,13 +18,13 @@ static const char heartbeat_text[] = ":\n\n", greeting[] = "retry: 2000\n\n";
 /*
  * To send one event to one watcher takes some 12 us of a processor, most of it in
  * the kernel's send. A crowd is sent at once what happened within that many
- * times a moment, so that however fast a job is, a thousand watchers take a
- * tenth of one processor from it, and are sent within an eighth of a second.
+ * times a moment, so that however fast a job is, a thousand watchers take some six
+ * hundredths of one processor from it, and are sent within a fifth of a second.
  * Events that were put off are sent to all in the same instant, of a grid of a few: each
  * thread then works through its share without a sleep between, and beside the
  * others.
  */
-static const double moment = 120e-6, moments_most = 120e-3, instant = 10e-3; /* s */
+static const double moment = 200e-6, moments_most = 200e-3, instant = 10e-3; /* s */
 
 struct watcher {
 	struct http *http;
