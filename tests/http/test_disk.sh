@@ -97,6 +97,7 @@ test_a_read_that_fails_once_is_no_damage() {
 
 test_a_read_of_the_catalogue_that_fails_once_is_no_damage() {
 	local passed
+	need_sqlite
 	faulty_daemon
 	post_scan "$scan_dir"
 	post_projections "$scan_dir"
