@@ -141,7 +141,10 @@ static void tell(const struct correction_job *job, const struct agreement *agree
 		     100 * agreement->unexplained);
 }
 
-/* An order of the views that is not the true one breaks all up. */
+/*
+ * An order of the views that is not the true one breaks all up. What is known is how often it comes and goes while it
+ * does: a ventilator that stops half way has the same frequency.
+ */
 static void tell_breathing(const struct correction_job *job, const struct agreement *agreement, double bin)
 {
 	const struct breathing *breathing = &agreement->breathing;
@@ -152,11 +155,13 @@ static void tell_breathing(const struct correction_job *job, const struct agreem
 		return;
 	if (breathing->uneven.share > hill->share)
 		hill = &breathing->uneven;
-	warning_tell(job->warnings, "breathing",
-		     "what a row of the detector shows comes and goes about %.0f times in the sweep, by %.2g %% (root "
-		     "mean square), %.2g times what is slower and %.2g times the noise there: no object at rest does "
-		     "that, unless the arm shakes as often along its axis",
-		     hill->times_in_sweep, 100 * hill->share, hill->times, hill->share / hill->noise);
+	warning_tell(
+	    job->warnings, "breathing",
+	    "what a row of the detector shows comes and goes, all along the sweep or for a part of it, as often as "
+	    "about %.0f times in a whole one, by %.2g %% (root mean square over all of it), %.2g times what is "
+	    "slower and %.2g times the noise there: no object at rest does that, unless the arm shakes as often "
+	    "along its axis",
+	    hill->times_in_sweep, 100 * hill->share, hill->times, hill->share / hill->noise);
 }
 
 static int warn(const struct correction_job *job, void *opaque, struct error *err)

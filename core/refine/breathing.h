@@ -23,10 +23,10 @@ enum { BREATHING_LEAST = 5, BREATHING_MOST = 20 };
 
 /* The highest hill, as shares of what a row shows, root mean square over the rows. */
 struct hill {
-	double share; /* of the three frequencies about its top, above the least of those below */
-	double times; /* as much as there */
-	double noise; /* of three of the highest frequencies, which nobody breathes with */
-	double times_in_sweep;
+	double share;          /* of the three frequencies about its top, above the least of those below */
+	double times;          /* as much as there */
+	double noise;          /* of three of the highest frequencies, which nobody breathes with */
+	double times_in_sweep; /* how often it would be, were it so all along: a frequency, no count */
 };
 
 struct breathing {

@@ -259,6 +259,7 @@ test_what_breathes_is_told_and_no_motion_mends_it() {
 		cbct simulate --phantom ball --scale 30 --shift "15,5,$at" "${sweep[@]}" -o "$work/ball-$at" >/dev/null || fail "cbct simulate"
 	done
 	cp -r "$work/rests" "$work/breathes"
+	cp -r "$work/rests" "$work/stops" # its ventilator half way
 	/usr/bin/python3 - "$work" <<-'END' || fail "the ball's projections in turn, added to the others"
 		import array, math, sys
 		work = sys.argv[1]
@@ -268,18 +269,21 @@ test_what_breathes_is_told_and_no_motion_mends_it() {
 		        values.frombytes(file.read())
 		    return values
 		balls = [read(f"ball-{at}") for at in (0, 3, 6, 9, 12)]
-		for name, depth in (("rests", 0), ("breathes", 4)):
+		for name, depth, until in (("rests", 0, 96), ("breathes", 4, 96), ("stops", 4, 48)):
 		    all = read(name)
 		    for i in range(len(all)):
 		        view = i // (48 * 40)
-		        all[i] += balls[round(depth * math.cos(math.pi * 9 * view / 96) ** 4)][i]
+		        all[i] += balls[round(depth * math.cos(math.pi * 9 * view / 96) ** 4) if view < until else 0][i]
 		    with open(f"{work}/{name}/projections.raw", "wb") as file:
 		        all.tofile(file)
 	END
 	reconstruct "$work/rests" "$recipe"'"fdk": {}}'
 	expect_json '.warnings | all(.code != "breathing")'
-	reconstruct "$work/breathes" "$recipe"'"fdk": {}}'
-	expect_json '[.warnings[] | select(.code == "breathing" and .severity == "caution" and (.detail | test("about 9 times")))] | length == 1'
+	for at in stops breathes; do
+		reconstruct "$work/$at" "$recipe"'"fdk": {}}'
+		expect_json '[.warnings[] | select(.code == "breathing" and .severity == "caution" and
+			(.detail | test("or for a part of it, as often as about (8|9|10) times in a whole one")))] | length == 1'
+	done
 	post_job "$recipe"'"fdk": {}, "refine": {"motion": true}}'
 	wait_job succeeded
 	expect_json '[.warnings[] | select(.code == "breathing")] | length == 1'
