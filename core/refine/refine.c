@@ -8,26 +8,27 @@
 #include "core/refine/registration.h"
 
 enum { VIEWS_LEAST = 48, BINS_LEAST = 24, LEVELS = 2, BINS_COARSE = REFINE_BINS_MOST / 2 };
-static const double PI = 3.14159265358979323846;
 static const double ARC_LEAST = 2.8;   /* radians */
 static const double KNOTS_APART = 0.7; /* radians, at first */
 /* What an iteration with TV, and a step of the path, take, in FDKs of the bins: for the progress bar. */
 enum { ITERATION_WORK = 5, STEP_WORK = 10 };
 enum { OWN_ITERATIONS = 6 }; /* of the scan's own volume, which is asked about a reference's path */
+enum { TRIES_MOST = 3 };
 /*
  * Iterations before the first step; steps with the same knots; how often these are doubled; and over how many bins what
- * the volume lacks is alike (registration_options).
+ * the volume lacks is alike (registration_step): of several that are tried held-out views have the choice, and the next
+ * level has the same. What a leg lacks beside its screws is alike over far more bins than what a head does.
  */
 static const struct schedule {
 	int warm, steps, doublings;
-	double alike;
+	double alike[TRIES_MOST]; /* 0: as on the level before, or no more of them */
 } schedules[REFINE_KINDS][LEVELS] =
     {
-	[REFINE_GEOMETRY] = {{4, 5, 1, 400}, {2, 5, 0, 400}},
-	[REFINE_MOTION] = {{4, 5, 2, 100}, {2, 5, 0, 100}},
+	[REFINE_GEOMETRY] = {{4, 5, 1, {400}}, {2, 5, 0, {0}}},
+	[REFINE_MOTION] = {{4, 5, 2, {100, 400, 1600}}, {2, 5, 0, {0}}},
 },
-  alone = {4, 5, 2, 100}, /* of a scan that has few bins */
-    referred[LEVELS] = {{0, 4, 1, 100}, {0, 4, 0, 100}};
+  alone = {4, 5, 2, {100}}, /* of a scan that has few bins: the geometry */
+    referred[LEVELS] = {{0, 4, 1, {100}}, {0, 4, 0, {100}}};
 /*
  * What a path must reach to be kept: the share by which held-out views are explained better, the share of these views
  * that are, and the path's size in bins. Of 17 paths that were found where nothing is to be found one passed the first,
@@ -50,13 +51,16 @@ static const double OWN_WORSE = 0.003;
 struct run {
 	const struct refine_watch *watch;
 	double work_all, work_done, unit; /* updates of a voxel by a view; unit: of one FDK of the level */
-	double *squares[2]; /* [views], of held-out ones: what is unexplained without motion, and with it */
+	/* [views], of held-out ones: what is unexplained without motion, with it, and with the path that is tried */
+	double *squares[3];
 	const struct refine_reference *reference;
 	struct grid grid;  /* of the coarser level's volumes, */
 	float *volumes[2]; /* without motion and with it; NULL on the first level */
 	size_t voxels[2];  /* in these */
 	struct refinement *refinement;
-	double sums[2];            /* of squares[] */
+	double sums[3];            /* of squares[] */
+	struct path best;          /* of the level: the path that squares[1] are of, */
+	double alike;              /* and what it was found with */
 	const struct path *placed; /* as the level's views stand; NULL: as the scan says */
 	int at, reached;           /* steps so far, and those that an earlier run has made */
 };
@@ -66,57 +70,6 @@ bool refine_is_possible(const struct geometry *geometry, const struct orbit *orb
 	return geometry->count >= (is_referred ? VIEWS_LEAST / 2 : VIEWS_LEAST) && geometry->columns >= BINS_LEAST &&
 	       geometry->rows >= BINS_LEAST && orbit->arc >= (is_referred ? ARC_LEAST / 2 : ARC_LEAST) &&
 	       orbit->field_of_view > 0 && (is_referred || !orbit->displaced);
-}
-
-double refine_place(const struct orbit *orbit, int view)
-{
-	const double turn = (orbit->angle[view] - orbit->angle[orbit->first]) * (orbit->direction < 0 ? -1 : 1);
-
-	return turn < -1e-9 ? turn + 2 * PI : fmax(0, turn);
-}
-
-void refine_change(enum refine_kind kind, const struct view *view, const double motion[PATH_NUMBERS],
-		   double ret_change[PATH_NUMBERS])
-{
-	/* What moves with the arm and stood at the isocentre. */
-	const struct view origin = {.source = {0}}, moved = view_of_moved(&origin, motion);
-	double axes[3][3];
-
-	if (kind == REFINE_MOTION) {
-		memcpy(ret_change, motion, PATH_NUMBERS * sizeof(*ret_change));
-	} else {
-		view_axes(view, axes);
-		for (int a = 0; a < 3; a++) {
-			ret_change[a] = vec_dot(axes[a], moved.source);
-			ret_change[3 + a] = -vec_dot(axes[a], motion + 3);
-		}
-	}
-	for (int a = 3; a < PATH_NUMBERS; a++)
-		ret_change[a] *= 180 / PI;
-}
-
-/* FNV-1a (Fowler, Noll and Vo), of 64 bits. */
-static uint64_t hash(uint64_t before, const void *data, size_t size)
-{
-	const unsigned char *bytes = data;
-
-	for (size_t i = 0; i < size; i++)
-		before = (before ^ bytes[i]) * 1099511628211u;
-	return before;
-}
-
-uint64_t refine_basis(const struct reduced *reduced, const struct orbit *orbit, enum refine_kind kind, double mu_water)
-{
-	const struct geometry *geometry = &reduced->geometry;
-	const size_t count = (size_t)geometry->count, bins = (size_t)geometry->columns * (size_t)geometry->rows;
-	uint64_t basis = hash(14695981039346656037u, &kind, sizeof(kind));
-
-	basis = hash(basis, &mu_water, sizeof(mu_water));
-	basis = hash(basis, geometry->views, count * sizeof(*geometry->views));
-	basis = hash(basis, reduced->views, count * sizeof(*reduced->views));
-	basis = hash(basis, reduced->known, count * sizeof(*reduced->known));
-	basis = hash(basis, reduced->projections, count * bins * sizeof(*reduced->projections));
-	return hash(basis, orbit->angle, (size_t)orbit->count * sizeof(*orbit->angle));
 }
 
 /* ---- levels ---- */
@@ -136,7 +89,7 @@ static const struct schedule *schedule_of(const struct reduced *reduced, int lev
 {
 	if (is_referred)
 		return &referred[level];
-	return levels_of(reduced) == 1 ? &alone : &schedules[kind][level];
+	return levels_of(reduced) == 1 && kind == REFINE_GEOMETRY ? &alone : &schedules[kind][level];
 }
 
 static struct registration_options options_of(const struct reduced *reduced, const struct reduced *half, int level,
@@ -149,17 +102,26 @@ static struct registration_options options_of(const struct reduced *reduced, con
 	return (struct registration_options){.reduced = is_coarse ? half : reduced,
 					     .kind = kind,
 					     .mu_water = 1,
-					     .alike = schedule_of(reduced, level, kind, is_referred)->alike,
 					     .referred = is_referred,
 					     .bins = is_fine && !is_coarse ? REFINE_BINS_MOST : BINS_COARSE};
+}
+
+/* Paths that are looked for on a level. */
+static int tries_of(const struct schedule *schedule)
+{
+	int tries = 1;
+
+	while (tries < TRIES_MOST && schedule->alike[tries] > 0)
+		tries++;
+	return tries;
 }
 
 /* FDKs of a level. */
 static int work_of(const struct schedule *schedule, bool is_referred)
 {
-	const int steps = schedule->steps * (1 + schedule->doublings);
+	const int steps = schedule->steps * (1 + schedule->doublings), tries = tries_of(schedule);
 
-	return (is_referred ? 0 : 2 * (schedule->warm + steps) * ITERATION_WORK) + steps * STEP_WORK;
+	return (is_referred ? 0 : (1 + tries) * (schedule->warm + steps) * ITERATION_WORK) + tries * steps * STEP_WORK;
 }
 
 int refine_bytes(const struct reduced *reduced, const struct refine_device *on, struct refine_bytes *ret_bytes,
@@ -219,18 +181,19 @@ int refine_work(const struct reduced *reduced, enum refine_kind kind, bool is_re
 /* ---- what has been reached ---- */
 
 /* A change of what the bytes mean, or of the steps, is another version. */
-#define STATE_NAME "cbctd refining 1"
+#define STATE_NAME "cbctd refining 2"
 struct state_head {
 	char name[24];
 	struct refinement refinement;
-	double sums[2];
+	double sums[3], alike;
+	struct path best;
 	int at, views;
 	size_t voxels[3]; /* of the level before without motion and with it, and of the level's own volume */
 };
 
 static size_t state_bytes(const struct state_head *head)
 {
-	return sizeof(*head) + 2 * (size_t)head->views * sizeof(double) +
+	return sizeof(*head) + 3 * (size_t)head->views * sizeof(double) +
 	       (head->voxels[0] + head->voxels[1] + head->voxels[2]) * sizeof(float);
 }
 
@@ -244,6 +207,8 @@ static int keep_state(struct run *run, struct registration *fit, struct error *e
 	memcpy(head.name, STATE_NAME, sizeof(STATE_NAME));
 	head.refinement = *run->refinement;
 	memcpy(head.sums, run->sums, sizeof(head.sums));
+	head.alike = run->alike;
+	head.best = run->best;
 	head.at = run->at;
 	head.views = fit->reduced->geometry.count;
 	for (int i = 0; i < 2; i++)
@@ -258,6 +223,7 @@ static int keep_state(struct run *run, struct registration *fit, struct error *e
 				      &(struct refine_state){{{&head, sizeof(head)},
 							      {run->squares[0], squares},
 							      {run->squares[1], squares},
+							      {run->squares[2], squares},
 							      {run->volumes[0], head.voxels[0] * sizeof(float)},
 							      {run->volumes[1], head.voxels[1] * sizeof(float)},
 							      {fit->voxels, head.voxels[2] * sizeof(float)}}},
@@ -303,7 +269,9 @@ static int take_up(struct run *run, struct registration *fit, struct error *err)
 		return error_set(err, ERR_DAMAGED, "what a refinement has reached is of another grid");
 	*run->refinement = head.refinement;
 	memcpy(run->sums, head.sums, sizeof(run->sums));
-	for (int i = 0; i < 2; i++, from += (size_t)head.views * sizeof(double))
+	run->alike = head.alike;
+	run->best = head.best;
+	for (int i = 0; i < 3; i++, from += (size_t)head.views * sizeof(double))
 		memcpy(run->squares[i], from, (size_t)head.views * sizeof(double));
 	for (int i = 0; i < 2; i++) {
 		free(run->volumes[i]);
@@ -378,7 +346,7 @@ static int iterate(struct run *run, struct registration *fit, int count, struct 
 	return code;
 }
 
-/* What the held-out views do not show: [0] without motion, [1] with it. */
+/* What the held-out views do not show: [0] without motion, [1] with it, [2] with what is tried. */
 static int measure(struct run *run, struct registration *fit, int which, struct error *err)
 {
 	return is_caught_up(run) ? registration_measure(fit, run->squares[which], &run->sums[which], err) : 0;
@@ -397,9 +365,10 @@ static int run_still(struct run *run, struct registration *fit, const struct sch
 }
 
 /* Steps of the path, and between them iterations of the volume where that is no reference. */
-static int follow_path(struct run *run, struct registration *fit, const struct schedule *schedule, struct path *path,
+static int follow_path(struct run *run, struct registration *fit, const struct schedule *schedule, const double *alike,
 		       struct error *err)
 {
+	struct path *path = &run->refinement->path;
 	int code = 0;
 
 	for (int doubled = 0; doubled <= schedule->doublings && code == 0; doubled++) {
@@ -407,7 +376,7 @@ static int follow_path(struct run *run, struct registration *fit, const struct s
 			path_double(path);
 		for (int i = 0; i < schedule->steps && code == 0; i++) {
 			if (!is_made(run)) {
-				code = registration_step(fit, path, err);
+				code = registration_step(fit, path, *alike, err);
 				if (code == 0)
 					code = place(run, fit, path, err);
 			}
@@ -420,18 +389,19 @@ static int follow_path(struct run *run, struct registration *fit, const struct s
 	return code;
 }
 
-static int run_moved(struct run *run, struct registration *fit, const struct schedule *schedule, struct path *path,
+/* From the coarser level's volume on, or from nothing. */
+static int run_moved(struct run *run, struct registration *fit, const struct schedule *schedule, const double *alike,
 		     struct error *err)
 {
-	int code = place(run, fit, path, err);
+	int code = place(run, fit, &run->refinement->path, err);
 
 	if (code == 0)
-		code = registration_start(fit, &run->grid, run->volumes[1], err);
+		code = registration_start(fit, &run->grid, run->grid.size[0] > 0 ? run->volumes[1] : NULL, err);
 	if (code == 0)
 		code = iterate(run, fit, schedule->warm, err);
 	if (code == 0)
-		code = follow_path(run, fit, schedule, path, err);
-	return code == 0 ? measure(run, fit, 1, err) : code;
+		code = follow_path(run, fit, schedule, alike, err);
+	return code == 0 ? measure(run, fit, 2, err) : code;
 }
 
 /* The same steps with a reference, which is there from the beginning. */
@@ -447,7 +417,7 @@ static int run_referred(struct run *run, struct registration *fit, const struct 
 	if (code == 0)
 		code = place(run, fit, &refinement->path, err);
 	if (code == 0)
-		code = follow_path(run, fit, schedule, &refinement->path, err);
+		code = follow_path(run, fit, schedule, schedule->alike, err);
 	if (code == 0)
 		code = measure(run, fit, 1, err);
 	return code == 0 && is_caught_up(run) ? registration_alike(fit, &refinement->alike, err) : code;
@@ -463,18 +433,59 @@ static int keep_volume(struct run *run, struct registration *fit, int which, str
 	return run->volumes[which] == NULL ? err->code : 0;
 }
 
+/* How many held-out views are explained better in one way than in another. */
+static int count_better(const double *squares, const double *others, int count)
+{
+	int better = 0;
+
+	for (int i = 0; i < count; i++)
+		better += squares[i] < others[i];
+	return better;
+}
+
+/*
+ * The first path of a level is kept, or one that explains held-out views better than those before, and most of them: a
+ * single view has a say in the sum that is none.
+ */
+static int keep_better(struct run *run, struct registration *fit, bool first, double alike, bool last,
+		       struct error *err)
+{
+	double *const squares = run->squares[1];
+
+	if (!is_caught_up(run))
+		return 0;
+	if (!first && (run->sums[2] >= run->sums[1] ||
+		       count_better(run->squares[2], squares, fit->held_count) < BETTER_VIEWS * fit->held_count))
+		return 0;
+	run->squares[1] = run->squares[2];
+	run->squares[2] = squares;
+	run->sums[1] = run->sums[2];
+	run->best = run->refinement->path;
+	run->alike = alike;
+	return last ? 0 : keep_volume(run, fit, 1, err);
+}
+
 /* From the volumes of the level before, and for the next one. */
 static int run_alone(struct run *run, struct registration *fit, const struct schedule *schedule, bool last,
 		     struct error *err)
 {
+	struct path *path = &run->refinement->path;
 	int code = run_still(run, fit, schedule, err);
+	const struct path start = *path;
 
 	if (code == 0 && !last)
 		code = keep_volume(run, fit, 0, err);
-	if (code == 0)
-		code = run_moved(run, fit, schedule, &run->refinement->path, err);
-	if (code == 0 && !last)
-		code = keep_volume(run, fit, 1, err);
+	for (int i = 0; i < tries_of(schedule) && code == 0; i++) {
+		/* An earlier run's is taken up in between. */
+		const double *alike = schedule->alike[i] > 0 ? &schedule->alike[i] : &run->alike;
+
+		*path = start;
+		code = run_moved(run, fit, schedule, alike, err);
+		if (code == 0)
+			code = keep_better(run, fit, i == 0, *alike, last, err);
+	}
+	if (is_caught_up(run))
+		*path = run->best;
 	run->grid = fit->grid;
 	return code;
 }
@@ -500,9 +511,7 @@ static void judge(const struct run *run, const struct registration *fit)
 	refinement->held_out = fit->held_count;
 	refinement->held_before = sqrt(run->sums[0] / values);
 	refinement->held_after = sqrt(run->sums[1] / values);
-	refinement->better = 0;
-	for (int i = 0; i < fit->held_count; i++)
-		refinement->better += run->squares[1][i] < run->squares[0][i];
+	refinement->better = count_better(run->squares[1], run->squares[0], fit->held_count);
 	refinement->accepted = refinement->held_after < refinement->held_before * (1 - BETTER[fit->kind]) &&
 			       refinement->better >= BETTER_VIEWS * fit->held_count &&
 			       size_of(fit, refinement) > SIZE_LEAST * bin &&
@@ -570,8 +579,8 @@ static int open_run(struct run *run, const struct reduced *reduced, struct reduc
 	*run = (struct run){.watch = watch, .reference = reference};
 	if (code == 0)
 		code = count_updates(reduced, half, kind, reference != NULL, false, &run->work_all, err);
-	for (int i = 0; i < 2 && code == 0; i++) {
-		run->squares[i] = malloc((size_t)reduced->geometry.count * sizeof(double));
+	for (int i = 0; i < 3 && code == 0; i++) {
+		run->squares[i] = calloc((size_t)reduced->geometry.count, sizeof(double));
 		if (run->squares[i] == NULL)
 			code = error_set(err, ERR_NO_MEMORY, "no memory for %d views", reduced->geometry.count);
 	}
@@ -580,10 +589,10 @@ static int open_run(struct run *run, const struct reduced *reduced, struct reduc
 
 static void close_run(struct run *run)
 {
-	for (int i = 0; i < 2; i++) {
+	for (int i = 0; i < 3; i++)
 		free(run->squares[i]);
+	for (int i = 0; i < 2; i++)
 		free(run->volumes[i]);
-	}
 }
 
 /* A path of no motion. */

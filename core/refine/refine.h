@@ -20,6 +20,9 @@
  * volume where it is while the path is found that is small about the views' own axes. First this is done in bins of
  * twice the size, then from there on in those that are given.
  *
+ * How far a residual is to be trusted depends on what the volume lacks, which differs from a head to a leg with screws:
+ * a motion is looked for with three degrees of trust, and views that are held out have the choice.
+ *
  * One view in eight has no part in volume and path. What the volume says of these views, moved as the path says, is
  * held against what the same iterations say of them without any motion; a path is kept only where that is better, and
  * where the path is larger than most that are found where there is nothing to find (one of 24 such scans keeps one, of
@@ -106,7 +109,7 @@ int refine_work(const struct reduced *reduced, enum refine_kind kind, bool is_re
  * What a refinement has reached behind a step, in pieces that follow each other in a file; borrowed for the call. Such
  * bytes, whole, are what another run of the same views goes on from.
  */
-enum { REFINE_PIECES = 6 };
+enum { REFINE_PIECES = 7 };
 struct refine_state {
 	struct refine_piece {
 		const void *bytes;

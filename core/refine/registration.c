@@ -103,7 +103,6 @@ static int describe(struct registration *fit, const struct registration_options 
 				     .device = options->on == NULL ? NULL : options->on->device,
 				     .kind = options->kind,
 				     .watch = options->watch,
-				     .alike = options->alike,
 				     .referred = options->referred,
 				     .cut = options->empty ? options->wide : is_cut(reduced)};
 	code = geometry_copy(&fit->geometry, &reduced->geometry, err);
@@ -366,7 +365,7 @@ static int thread_number(void)
 }
 
 /* Squares and products of the i-th of the views in use, weighted, over the residual's variance. */
-static void add_up_view(struct registration *fit, int used)
+static void add_up_view(struct registration *fit, int used, double alike)
 {
 	const int columns = fit->geometry.columns, rows = fit->geometry.rows;
 	const size_t pixels = pixels_of(fit), apart = (size_t)fit->geometry.count * pixels;
@@ -396,13 +395,13 @@ static void add_up_view(struct registration *fit, int used)
 				for (int j = 0; j <= i; j++)
 					products[at++] += weight * value[i] * value[j];
 		}
-	weights /= fit->alike * (fit->cut ? ALIKE_CUT : 1) * products[0] + 1e-12;
+	weights /= alike * (fit->cut ? ALIKE_CUT : 1) * products[0] + 1e-12;
 	for (int i = 0; i < PATH_PRODUCTS; i++)
 		products[i] *= weights;
 }
 
 /* One step of the path, from the volume as it is. */
-int registration_step(struct registration *fit, struct path *path, struct error *err)
+int registration_step(struct registration *fit, struct path *path, double alike, struct error *err)
 {
 	const struct backend *backend = fit->backend;
 	int code = find_residuals(fit, fit->used, fit->used_count, err);
@@ -421,7 +420,7 @@ int registration_step(struct registration *fit, struct path *path, struct error 
 		return code;
 #pragma omp parallel for schedule(dynamic)
 	for (int i = 0; i < fit->used_count; i++) {
-		add_up_view(fit, i);
+		add_up_view(fit, i, alike);
 		pulse_beat();
 	}
 	return path_step(path, fit->views, fit->geometry.count,

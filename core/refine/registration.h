@@ -14,7 +14,6 @@ struct registration {
 	const struct reduced *reduced;
 	const struct refine_watch *watch;
 	enum refine_kind kind;
-	double alike;
 	bool referred;            /* the volume is a reference, and stays what it is */
 	bool cut;                 /* the body goes on beside the detector */
 	struct geometry geometry; /* of the bins, as the path moves it */
@@ -43,11 +42,6 @@ struct registration_options {
 	const struct orbit *orbit; /* of the scan; only registration_open needs it */
 	enum refine_kind kind;
 	double mu_water; /* 1/mm */
-	/*
-	 * The residual is no noise but what the volume lacks, which is alike over far more than a smoothed bin's
-	 * neighbours: its variance counts so many times.
-	 */
-	double alike;
 	bool referred;
 	int bins; /* the most voxels along the grid's sides, but for what is added for a body that is cut */
 	const struct refine_watch *watch; /* NULL: nobody watches */
@@ -66,8 +60,11 @@ void registration_clear(struct registration *fit);
 int registration_place(struct registration *fit, const struct path *path, struct error *err);
 /* One iteration of SART, and TV. */
 int registration_iterate(struct registration *fit, struct error *err);
-/* One step of the path, from the volume as it is. */
-int registration_step(struct registration *fit, struct path *path, struct error *err);
+/*
+ * One step of the path, from the volume as it is. The residual is no noise but what the volume lacks, which is alike
+ * over far more than a smoothed bin's neighbours: its variance counts `alike` times.
+ */
+int registration_step(struct registration *fit, struct path *path, double alike, struct error *err);
 /* Squares of the detail of each held-out view that the volume does not explain, [held_count], and their sum. */
 int registration_measure(struct registration *fit, double *ret_squares, double *ret_sum, struct error *err);
 /*
