@@ -83,10 +83,11 @@ static void study_project_voxels(struct study *study)
 		memcpy(study->scene.projections, left->projections, bytes);
 		return;
 	}
-	/* Ten samples a voxel: halving the step changes no figure here in its third digit. */
+	/* Five samples a voxel: with ten the first test ends at .00215 in place of .00226, and no other error of this
+	 * suite moves by more than .00004. */
 	for (int view = 0; view < geometry->count; view++)
 		volume_project_fine(study->truth, &study->grid, geometry, view, SAMPLE_TRILINEAR,
-				    0.1 * study->grid.spacing[0], study->scene.projections + samples * (size_t)view);
+				    0.2 * study->grid.spacing[0], study->scene.projections + samples * (size_t)view);
 	if (left != NULL) {
 		memcpy(left->projections, study->scene.projections, bytes);
 		left->made = true;
