@@ -13,6 +13,12 @@
 /* Dense from so many times water's attenuation on; cortical bone has up to 3.0. */
 #define DENSE_LEAST 3.1
 
+/*
+ * Dense voxels below this many times water's attenuation are none of metal where they are wide and even: compact bone,
+ * plastic, contrast. Iterations mend what FDK has of such, and without the rays through it there is nothing to do that.
+ */
+#define DENSE_EVEN 5.0
+
 /* Dense voxels: how many, those of the object, and the mean of their values, 1/mm. */
 struct dense_count {
 	size_t dense, object;
@@ -23,9 +29,12 @@ void dense_add(struct dense_count *to, const float *values, size_t count, double
 void dense_counted(struct dense_count *count);
 /* True if too much of the object is dense to leave its rays out. */
 bool dense_is_most(const struct dense_count *count);
-/* True if too many of all rays are in these traces for what is no denser. */
+/* metal_find of what is dense; where that is even, of what has DENSE_EVEN times water's attenuation, and belongs to it.
+ */
+int dense_find(struct metal *dense, const struct metal_tools *tools, struct volume *from, struct error *err);
+/* True if too many of all rays are in these traces for what is no denser; windowed: the voxels are FDK's with one. */
 bool dense_passes_too_many(const struct dense_count *count, const struct metal *dense, const struct geometry *geometry,
-			   double mu_water);
+			   double mu_water, bool windowed);
 
 /*
  * Between exterior_volume_make and its fit. A rod that crosses the grid's edge has a part that no voxel explains, and

@@ -52,7 +52,7 @@ static int find(const struct correction_job *job, const struct exterior_volume *
 		struct error *err)
 {
 	const double mu_water = job->recipe->mu_water;
-	int code = metal_find(&found->all, tools, exterior->volume, DENSE_LEAST * mu_water, err);
+	int code = dense_find(&found->all, tools, exterior->volume, err);
 
 	if (code == 0)
 		code = take_outside(&found->all, &job->recipe->grid, &exterior->grid, &found->outside, err);
@@ -60,7 +60,7 @@ static int find(const struct correction_job *job, const struct exterior_volume *
 		return code;
 	found->drawn = true;
 	code = metal_find_traces(&found->all, tools, err);
-	if (code < 0 || dense_passes_too_many(count, &found->all, job->geometry, mu_water))
+	if (code < 0 || dense_passes_too_many(count, &found->all, job->geometry, mu_water, false))
 		return code;
 	return metal_find_traces(&found->outside, tools, err);
 }

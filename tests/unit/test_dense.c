@@ -35,6 +35,8 @@ static const struct {
     {"across the grid's edge", 1, 5, 107, 17, "rays_left_out: "},
     {"thin, across the grid's edge", 1, 3, 107, 17, "rays_left_out: "},
     {"across the field of view's edge", 1, 5, 111, 17, "rays_left_out: "},
+    {"plastic that is less dense, across the grid's edge", 1, 9, 99, 3.05, NULL},
+    {"compact bone", 1, 14, 50, 3.1, "very_dense: "},
     {"in the field of view, outside of the grid", 1, 5, 115, 17, "iterations_held_back: "},
     {"outside of both", 1, 5, 130, 17, "iterations_held_back: "},
 };
