@@ -8,6 +8,7 @@
 #include "core/select.h"
 
 enum { BESIDE_MOST = 3 }; /* places up to the next one that is in */
+enum { EIGHTHS = 8 };     /* parts of the detector along its columns and rows */
 enum { AROUND = 10, USUAL_LEAST = 4, VIEWS_LEAST = 24, PIECES_MOST = 96, PIXELS_LEAST = 16, SINGLES_MOST = 4 };
 /* Squares, of what is usual about there: cuts, a join; a single view at its own place, and at another one. */
 static const double CUT = 5, SMALLEST_CUT = 1.5, JOINS = 3, OFF = 6, FITS = 3;
@@ -215,6 +216,59 @@ static int put_in_order(const struct search *search, const struct piece *pieces,
 	return moved;
 }
 
+/* True if a view may stand right behind another one, at a place. */
+static bool joins(const struct search *search, int before, int behind, int place)
+{
+	return apart_of(search, search->views[before], search->views[behind]) <= JOINS * search->usual[place];
+}
+
+static void turn_about(const struct search *search, const struct piece *piece)
+{
+	const int all = search->ring->count;
+
+	for (int i = piece->first, k = piece->end - 1; i < k; i++, k--) {
+		const int view = search->views[i % all];
+
+		search->views[i % all] = search->views[k % all];
+		search->views[k % all] = view;
+	}
+}
+
+/* True if a piece joins what lies on both sides when it is turned about. */
+static bool is_backward(const struct search *search, const struct piece *piece)
+{
+	const int all = search->ring->count;
+	const int first = piece->first % all, last = (piece->end - 1) % all, before = (first + all - 1) % all;
+
+	return piece->end - piece->first > 1 && !is_fixed(search->ring, before) && !is_fixed(search->ring, last) &&
+	       joins(search, before, last, before) && joins(search, first, (last + 1) % all, last);
+}
+
+/*
+ * Turns pieces about that were stored backwards, where that leaves no cut; returns how many views are elsewhere then.
+ * Two views that are exchanged let what lies between them look so, too, but leave cuts.
+ */
+static int turn_backward_ones(const struct search *search, const struct piece *pieces, int count)
+{
+	const int all = search->ring->count;
+	bool backward[PIECES_MOST];
+	int cuts = 0, moved = 0;
+
+	for (int p = 0; p < count; p++) {
+		const int length = pieces[p].end - pieces[p].first;
+
+		backward[p] = MOST * length <= all && is_backward(search, &pieces[p]);
+		cuts += !pieces[p].fixed - 2 * backward[p];
+		moved += backward[p] ? length / 2 * 2 : 0;
+	}
+	if (cuts != 0 || MOST * moved > all)
+		return 0;
+	for (int p = 0; p < count; p++)
+		if (backward[p])
+			turn_about(search, &pieces[p]);
+	return moved;
+}
+
 /* Finds the order of the views with cuts of this size; returns how many are not where they were. */
 static int find_order_of(const struct search *search, double cut)
 {
@@ -224,11 +278,13 @@ static int find_order_of(const struct search *search, double cut)
 	int before[PIECES_MOST], moved;
 
 	if (pieces_count < 3 || !join(search, pieces, pieces_count, search->costs, before))
-		return 0;
+		return turn_backward_ones(search, pieces, pieces_count);
 	moved = put_in_order(search, pieces, pieces_count, before, search->work);
+	if (moved == 0)
+		return turn_backward_ones(search, pieces, pieces_count);
 	if (MOST * moved > count)
 		return 0;
-	for (int i = 0; i < count && moved > 0; i++)
+	for (int i = 0; i < count; i++)
 		search->views[i] = search->work[i];
 	return moved;
 }

@@ -9,7 +9,8 @@
  * Views that were taken elsewhere than the scan says: exchanged with others, one by one or in runs, or single ones that
  * stand some degrees off. An object changes little from a view to the next. Where it changes by far more, the ring of
  * views is cut into pieces. If the pieces in another order have no such cut, each joined to the one that goes on where
- * it ends, that is the order in which they were taken, and the views are put there. What an object does by itself, a
+ * it ends, that is the order in which they were taken, and the views are put there. A piece that joins both of its
+ * neighbours when it is turned about was stored backwards. What an object does by itself, a
  * plate seen from its edge or a jerk of the patient, cuts the ring as well, but no other order mends that.
  *
  * A single view that lies far off what the views on both sides let be expected, and that lies between two other ones as

@@ -17,7 +17,8 @@ static const struct {
 	int off[2];                       /* the first view shows what the second does, half a view further on */
 	double step;                      /* degrees */
 	int mended, left_out;
-	double plate; /* 1/mm, seen from its edge in two views */
+	double plate;    /* 1/mm, seen from its edge in two views */
+	int backward[2]; /* so many views from the second on come last first */
 } rows[] = {
     {.exchanged = {{1, 7, 30}}, .step = 6, .mended = 2},
     {.exchanged = {{1, 7, 11}, {1, 20, 52}, {1, 25, 45}}, .step = 6, .mended = 6},
@@ -29,6 +30,8 @@ static const struct {
     {.step = 6},
     {.step = 6, .plate = .05},
     {.step = 3.5, .plate = .3},
+    {.backward = {6, 21}, .step = 6, .mended = 6},
+    {.backward = {5, 40}, .step = 3.5, .mended = 4}, /* the middle one is where it belongs */
 };
 enum { ROWS_OF_TEST = sizeof(rows) / sizeof(rows[0]) };
 
@@ -65,6 +68,9 @@ static void spoil(struct scene *scene, int row)
 	for (int i = 0; i < EXCHANGES_MOST; i++)
 		for (int k = 0; k < rows[row].exchanged[i][0]; k++)
 			exchange(scene->projections, rows[row].exchanged[i][1] + k, rows[row].exchanged[i][2] + k);
+	for (int k = 0; k < rows[row].backward[0] / 2; k++)
+		exchange(scene->projections, rows[row].backward[1] + k,
+			 rows[row].backward[1] + rows[row].backward[0] - 1 - k);
 	if (rows[row].off[1] > 0) {
 		const struct orbit_spec spec = spec_of(1, (rows[row].off[1] + .5) * rows[row].step, rows[row].step);
 		struct scene other;
