@@ -287,9 +287,8 @@ static void tell_kept(const struct correction_job *job, const struct dense_count
 {
 	warning_tell(
 	    job->warnings, "very_dense",
-	    "%zu voxels have at least %g HU, %.3g %% of those of the object, and %.0f HU in the mean: too many, too "
-	    "many "
-	    "rays pass them, or they are too wide and even for metal, to leave those rays out of the iterations",
+	    "%zu voxels have at least %g HU, %.3g %% of those of the object, and %.0f HU in the mean: too many, or too "
+	    "wide and even for metal, or too many rays pass them, to leave those rays out of the iterations",
 	    count->dense, 1000 * (DENSE_LEAST - 1), 100 * (double)count->dense / (double)count->object,
 	    1000 * (count->mean / job->recipe->mu_water - 1));
 }
