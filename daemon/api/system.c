@@ -35,6 +35,16 @@ static void write_troubles(const struct api *api, const char *begin, char *ret_t
 					   begin, troubles[i].host, troubles[i].text);
 }
 
+/* The room for the records of removals is in use, or others have filled the disk so far that hardly anything fits. */
+static bool disk_is_full(const struct store *store)
+{
+	enum { HARDLY = 64 << 10 }; /* bytes */
+	unsigned long long available;
+	struct error ignored;
+
+	return !store_reserve_whole(store) || (store_space(store, &available, &ignored) == 0 && available < HARDLY);
+}
+
 /* Ready all the same: what is set aside, and an audit log that has no room, hinder nobody, but somebody should look. */
 static int reply_ready(struct request *request, const struct api *api, struct error *err)
 {
@@ -50,12 +60,10 @@ static int reply_ready(struct request *request, const struct api *api, struct er
 	else
 		snprintf(quarantine, sizeof(quarantine), "quarantine: %d set aside, see /v1/quarantine\n", count);
 	write_troubles(api, "fleet: ", fleet, sizeof(fleet));
-	snprintf(text, sizeof(text), "ready\n%s%s%s%s", quarantine,
-		 store_reserve_whole(api->store)
-		     ? ""
-		     : "disk: it is full, nothing new can be stored until something is removed\n",
-		 http_audit_fails(api->http) ? "audit: it cannot be written, lines are lost, see the log\n" : "",
-		 fleet);
+	snprintf(
+	    text, sizeof(text), "ready\n%s%s%s%s", quarantine,
+	    disk_is_full(api->store) ? "disk: it is full, nothing new can be stored until something is removed\n" : "",
+	    http_audit_fails(api->http) ? "audit: it cannot be written, lines are lost, see the log\n" : "", fleet);
 	return reply_word(request, text, err);
 }
 

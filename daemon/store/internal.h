@@ -35,8 +35,13 @@ struct store {
 	struct catalogue *catalogue;
 	/* Within a group of the catalogue, as the next two; store/deleted.h. */
 	struct deleted *deleted;
-	long long stamp;              /* of the latest record that was written; store/record.h */
-	long long event_written;      /* by the group under way, 0: none */
+	long long stamp;         /* of the latest record that was written; store/record.h */
+	long long event_written; /* by the group under way, 0: none */
+	/*
+	 * The number of an event that a group wrote that was not committed, or is about to be; 0: none. A record may
+	 * have it, so the next group goes on behind it: no number is used twice.
+	 */
+	_Atomic long long event_open;
 	struct store_repairs repairs; /* constant after the start, as the next two */
 	/* Records that are ahead of their rows, which could not be read; put right in the next group. */
 	pthread_mutex_t undone_lock; /* guards the next two */

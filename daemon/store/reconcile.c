@@ -134,7 +134,15 @@ static int settle_difference(struct reconciliation *r, const struct known *known
 	if (own > known->stamp) {
 		log_line(LEVEL_WARNING, "%s %s: its directory is ahead of the catalogue, which follows", kind,
 			 known->id);
-		code = apply(r, record, err);
+		code = apply(r, record, &why);
+		if (code == ERR_INVALID) {
+			/* Such a record was never acknowledged, and must not keep the daemon from starting. */
+			log_line(LEVEL_WARNING, "%s %s: %s: its " RECORD_FILE " is written again", kind, known->id,
+				 why.text);
+			code = write_again(r, known, err);
+		} else if (code != 0) {
+			*err = why;
+		}
 	} else if (own < known->stamp) {
 		log_line(LEVEL_WARNING, "%s %s: its " RECORD_FILE " is behind the catalogue and written again", kind,
 			 known->id);

@@ -180,6 +180,12 @@ static void tell_ahead(enum record_kind kind, const char *id, const struct error
 		 err->text);
 }
 
+/* What may be done later: the database comes back, or there is room again. */
+static bool is_put_off(int code)
+{
+	return code == ERR_AWAY || code == ERR_NO_SPACE;
+}
+
 void record_undo(struct store *store, enum record_kind kind, const char *id)
 {
 	struct error err;
@@ -190,7 +196,7 @@ void record_undo(struct store *store, enum record_kind kind, const char *id)
 	code = catalogue_begin(store->catalogue, true, &err);
 	if (code == 0)
 		code = catalogue_end(store->catalogue, write_former(store, kind, id, &err), &err);
-	if (code == ERR_AWAY)
+	if (is_put_off(code))
 		code = add_undone(store, kind, id, &err);
 	if (code != 0)
 		tell_ahead(kind, id, &err);
@@ -216,13 +222,13 @@ void record_undo_rest(struct store *store)
 	struct error err;
 	int code = 0;
 
-	while (code != ERR_AWAY && take_undone(store, &undone)) {
+	while (!is_put_off(code) && take_undone(store, &undone)) {
 		code = write_former(store, undone.kind, undone.id, &err);
 		record_directory(store, undone.kind, undone.id, directory);
 		rmdir(directory); /* of a job that was not posted after all; any other is not empty */
-		if (code == ERR_AWAY)
-			code = add_undone(store, undone.kind, undone.id, &err) == 0 ? ERR_AWAY : err.code;
-		if (code != 0 && code != ERR_AWAY)
+		if (is_put_off(code) && add_undone(store, undone.kind, undone.id, &err) != 0)
+			code = err.code;
+		if (code != 0 && !is_put_off(code))
 			tell_ahead(undone.kind, undone.id, &err);
 	}
 }

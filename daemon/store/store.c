@@ -397,11 +397,16 @@ void store_close(struct store *store)
 static int begin(struct store *store, bool synced, struct error *err)
 {
 	int code = catalogue_begin(store->catalogue, synced, err);
+	const long long open = atomic_load(&store->event_open);
 
-	if (code == 0 && atomic_load(&store->failed)) {
+	if (code != 0)
+		return code;
+	if (atomic_load(&store->failed))
 		code = error_set(err, ERR_IO, "the catalogue has failed before; nothing more is stored");
-		catalogue_end(store->catalogue, code, err);
-	}
+	else if (open != 0)
+		code = catalogue_pass_events(store->catalogue, open, err);
+	if (code != 0)
+		code = catalogue_end(store->catalogue, code, err);
 	if (code == 0)
 		record_undo_rest(store);
 	return code;
@@ -429,13 +434,17 @@ int store_begin_unsynced(struct store *store, struct error *err)
 
 int store_end(struct store *store, int code, struct error *err)
 {
-	long long event = store->event_written, last;
+	long long event = store->event_written, last, open;
 	double before = clock_monotonic();
 
 	store->event_written = 0;
+	if (event != 0)
+		atomic_store(&store->event_open, event);
+	open = atomic_load(&store->event_open);
 	code = catalogue_end(store->catalogue, code, err);
 	if (code != 0)
 		return code;
+	atomic_compare_exchange_strong(&store->event_open, &open, 0); /* unless the next group has one by now */
 	/* The next group may have been faster. */
 	last = atomic_load(&store->last_event);
 	while (event > last && !atomic_compare_exchange_weak(&store->last_event, &last, event))

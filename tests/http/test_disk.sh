@@ -268,6 +268,20 @@ test_starts_on_a_full_disk_again_and_again() {
 	stop_daemon
 }
 
+test_a_step_that_had_no_room_keeps_no_daemon_from_starting() {
+	truncate -s 48m "$work/image"
+	mkfs.ext4 -q -m 0 "$work/image"
+	disk=$work/small # not local: the trap runs after the function
+	mkdir -p "$disk"
+	mount -o loop "$work/image" "$disk" 2>/dev/null || skip "no permission to mount a small disk"
+	trap 'umount "$disk"' EXIT
+	state=$disk/state start_daemon
+	post_scan "$scan_dir"
+	post_projections "$scan_dir"
+	stop_daemon
+	python3 "$here/full_disk.py" "$BUILD" "$disk" "$scan"
+}
+
 test_a_moment_without_descriptors_or_with_a_slow_disk_ends_no_job() {
 	faulty_daemon
 	post_scan "$scan_dir"
