@@ -8,7 +8,6 @@
 #include "core/select.h"
 
 enum { BESIDE_MOST = 3 }; /* places up to the next one that is in */
-enum { EIGHTHS = 8 };     /* parts of the detector along its columns and rows */
 enum { AROUND = 10, USUAL_LEAST = 4, VIEWS_LEAST = 24, PIECES_MOST = 96, PIXELS_LEAST = 16, SINGLES_MOST = 4 };
 /* Squares, of what is usual about there: cuts, a join; a single view at its own place, and at another one. */
 static const double CUT = 5, SMALLEST_CUT = 1.5, JOINS = 3, OFF = 6, FITS = 3;
