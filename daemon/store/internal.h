@@ -43,7 +43,8 @@ struct store {
 	 */
 	_Atomic long long event_open;
 	struct store_repairs repairs; /* constant after the start, as the next two */
-	/* Records ahead of their rows that could not be taken back (no room, no database); put right in a later group. */
+	/* Records ahead of their rows that could not be taken back (no room, no database); put right in a later group.
+	 */
 	pthread_mutex_t undone_lock; /* guards the next two */
 	struct undone {
 		enum record_kind kind;
