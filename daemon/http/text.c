@@ -120,7 +120,9 @@ static double coding_quality(const char *header, const char *coding)
 
 bool accepts_coding(const char *header, const char *coding)
 {
-	return coding_quality(header, coding) > 0;
+	const double quality = coding_quality(header, coding);
+
+	return quality > 0 && quality >= coding_quality(header, "identity");
 }
 
 bool accepts_identity(const char *header)

@@ -208,6 +208,16 @@ test_volumes_come_in_every_format() {
 	[ "$(header content-encoding)" = zstd ] || fail "Content-Encoding: zstd"
 	zstd -q -d -c <"$body" | cmp - "$work/v.nii" || fail "the same bytes through zstd"
 	etag=$(header etag)
+	# what a client would rather have
+	for coding in "zstd;q=0.5, identity" "identity;q=0.2, zstd;q=0.1" "zstd;q=0"; do
+		req GET "/v1/jobs/$job/volumes/final" -H "Accept-Encoding: $coding"
+		[ -z "$(header content-encoding)" ] || fail "plain bytes for $coding"
+		cmp "$body" "$work/v.nii" || fail "the plain bytes for $coding"
+	done
+	for coding in "zstd, identity" "zstd;q=0.5, identity;q=0.5" "identity;q=0, zstd;q=0.001"; do
+		req GET "/v1/jobs/$job/volumes/final" -H "Accept-Encoding: $coding"
+		[ "$(header content-encoding)" = zstd ] || fail "zstd for $coding"
+	done
 	req GET "/v1/jobs/$job/volumes/final"
 	[ "$(header etag)" != "$etag" ] || fail "another ETag for another encoding"
 	etag=$(header etag)
