@@ -341,7 +341,9 @@ static int add_views(cJSON *document, const struct scan_facts *scan, struct job 
 static void add_waiting_for(cJSON *document, const struct scan_facts *scan, const struct job_record *record,
 			    struct job *job)
 {
-	const enum job_obstacle obstacle = job_obstacle(job);
+	/* What keeps a job that goes back to the queue is known a moment before it is there. */
+	const bool waits = record->state == JOB_WAITING || record->state == JOB_QUEUED;
+	const enum job_obstacle obstacle = waits ? job_obstacle(job) : JOB_UNHINDERED;
 	cJSON *list = cJSON_AddArrayToObject(document, "waiting_for");
 	char text[JOB_WAIT_SIZE];
 
