@@ -17,8 +17,8 @@
  *            stillest neighbour's does, and e is three times as large as theirs. Noise
  *            is enough of a variation.
  *   wanders  e varies by 9 times (variance) what it does in the second wildest
- *            neighbour, in most views and not in a few, as where something small
- *            passes, and the pixels beside it do not.
+ *            neighbour, the pixels beside it do not, and that in more views than something
+ *            small stays on a pixel for where it turns back, and than a quarter.
  *   apart    The mean of e is a tenth of the photons, three times as large as the second
  *            largest of the neighbours', four times what it varies by, and the pixels
  *            beside it are not like it: where nothing moves, as in air. An object with
@@ -39,6 +39,9 @@
  *            those within some pixels on both sides in the row in a quarter as many at most: a column that died since
  *            the flat was taken, whose other values are noise about the dark. Rays that pass the axis are left
  *            out, for metal there.
+ *
+ * None of the three holds where the pixel across the axis lies apart by half as much at least, too: what looks much
+ * the same from all sides, as a coil about the axis does, has two sides, and both stay on their pixels.
  *
  * A neighbour that says nothing, as one of the scan's map, is left out of m, and where that is
  * so in most views it counts as one that speaks for the pixel in the comparisons above.

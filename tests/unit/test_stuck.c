@@ -243,10 +243,11 @@ enum { SMALL_COLUMNS = 49, SMALL_ROWS = 33, SMALL_VIEWS = 40, SMALL = SMALL_COLU
  * What is found in a scan of a few parts, line integrals with that noise; `spoiled` pixels hold `value` in all views,
  * or where that is NAN, nothing in half of the views, and noise in the others.
  */
-static size_t find_in_small(struct ellipsoid *parts, int count, double noise, const bool *spoiled, float value)
+static size_t find_in_arc(struct ellipsoid *parts, int count, double arc, double noise, const bool *spoiled,
+			  float value)
 {
 	const struct orbit_spec spec = {
-	    SMALL_COLUMNS, SMALL_ROWS, SMALL_VIEWS, {600, 1000, {2, 2}, {0, 0}, {0, 0}}, 0, 360. / SMALL_VIEWS};
+	    SMALL_COLUMNS, SMALL_ROWS, SMALL_VIEWS, {600, 1000, {2, 2}, {0, 0}, {0, 0}}, 0, arc / SMALL_VIEWS};
 	const struct linearise linearise = {.sample = SAMPLE_FLOAT32};
 	struct phantom phantom = {.parts = parts, .count = count};
 	const unsigned char *map;
@@ -277,6 +278,11 @@ static size_t find_in_small(struct ellipsoid *parts, int count, double noise, co
 	return found;
 }
 
+static size_t find_in_small(struct ellipsoid *parts, int count, double noise, const bool *spoiled, float value)
+{
+	return find_in_arc(parts, count, 360, noise, spoiled, value);
+}
+
 /* Its shadow stays on two pixels in turn, and each of them does what the other does not. */
 START_TEST(a_bead_near_the_axis_is_no_stuck_pixel)
 {
@@ -294,6 +300,50 @@ START_TEST(a_bead_near_the_axis_is_no_stuck_pixel)
 
 		ck_assert_msg(found == 0, "%zu pixels: a bead %.2f mm off the axis, at %.1f mm", found, apart, z);
 	}
+}
+END_TEST
+
+/* Amid a short scan it stays on one pixel for a quarter of the views and more. */
+START_TEST(a_bead_that_turns_back_is_no_stuck_pixel)
+{
+	random_state = 5;
+	for (int bead = 0; bead < 200; bead++) {
+		const double apart = between(5, 13), where = between(1, 2.6);
+		struct ellipsoid part = {
+		    .shape = SHAPE_ELLIPSOID,
+		    .semi_axes = {between(.3, 1.2), between(.3, 1.2), between(.3, 1.2)},
+		    .centre = {apart * cos(where), apart * sin(where), 1.2 * (int)between(-9, 9)},
+		    .density = .08,
+		};
+		const size_t found = find_in_arc(&part, 1, bead % 2 ? 200 : 240, bead % 3 ? 0 : .003, NULL, 0);
+
+		ck_assert_msg(found == 0, "%zu pixels: bead %d, %.2f mm off the axis", found, bead, apart);
+	}
+}
+END_TEST
+
+/* Bars in a ring about the axis, a polygon: the shadows of its two sides stay on a pixel each, whose own they are. */
+START_TEST(a_coil_about_the_axis_is_no_stuck_pixel)
+{
+	for (int row = -2; row <= 2; row++)
+		for (int form = 0; form < 4; form++) {
+			enum { BARS = 12 };
+			const double height = (row + .25 * form) * 1.2, radius = 25 + 1.1 * form;
+			struct ellipsoid parts[BARS + 1] = {
+			    {.shape = SHAPE_ELLIPSOID, .semi_axes = {18, 15, 14}, .density = .02}};
+			size_t found;
+
+			for (int k = 0; k < BARS; k++)
+				parts[k + 1] = (struct ellipsoid){
+				    .shape = SHAPE_BOX,
+				    .semi_axes = {.5, 5.5, .5},
+				    .centre = {radius * cos(k * M_PI / 6), radius * sin(k * M_PI / 6), height},
+				    .angle = k * M_PI / 6,
+				    .density = .17};
+			found = find_in_small(parts, BARS + 1, 0, NULL, 0);
+			ck_assert_msg(found == 0, "%zu pixels: %.2f mm about the axis, at %.2f mm", found, radius,
+				      height);
+		}
 }
 END_TEST
 
@@ -725,6 +775,8 @@ Suite *stuck_suite(void)
 	tcase_add_loop_test(tests, an_object_is_no_stuck_pixel, 0, 4);
 	tcase_add_loop_test(tests, no_pixel_size_makes_stuck_pixels, 0, 2);
 	tcase_add_test(tests, a_bead_near_the_axis_is_no_stuck_pixel);
+	tcase_add_test(tests, a_bead_that_turns_back_is_no_stuck_pixel);
+	tcase_add_test(tests, a_coil_about_the_axis_is_no_stuck_pixel);
 	tcase_add_loop_test(tests, pixels_that_never_change_are_found_together, 0, 9);
 	tcase_add_loop_test(tests, a_pixel_that_does_not_follow_is_found, 0, 4);
 	tcase_add_loop_test(tests, a_neighbour_of_mapped_pixels_is_judged_by_good_ones, 0, 4);
