@@ -16,7 +16,7 @@ need_archive() {
 start_archive() {
 	local i
 	mkdir -p "$work/archive"
-	[ -n "${web:-}" ] || read -r web dimse commit < <("$python" "$top/tests/http/send.py" ports 3)
+	[ -n "${web:-}" ] || read -r web dimse commit < <("$python" "$top/tests/http/ports.py" 3)
 	mkdir -p "$work/worklist"
 	jq -n --argjson more "${more:-{\}}" --arg plugin "$plugin" --arg worklists "${plugin%/*}/libModalityWorklists.so" --arg worklist "$work/worklist" --arg work "$work/archive" --argjson web "$web" --argjson dimse "$dimse" --argjson commit "$commit" '{
 		Name: "ARCHIVE", DicomAet: "ARCHIVE", DicomCheckCalledAet: true, DicomPort: $dimse, HttpPort: $web, HttpBindAddresses: ["127.0.0.1"],

@@ -2,16 +2,11 @@
 import http.client
 import json
 import os
-import socket
 import subprocess
 import sys
 import time
 
-
-def free_port():
-    with socket.socket() as one:
-        one.bind(("127.0.0.1", 0))
-        return one.getsockname()[1]
+import ports
 
 
 def wait_for(condition, seconds, what):
@@ -27,7 +22,7 @@ class Host:
     network, its address, the command that starts programs there, the SSL context and the headers of requests to it."""
 
     def __init__(self, options, fleet, name, takes, arguments=(), environment=None, doors=None):
-        self.name, self.port = name, free_port()
+        self.name, self.port = name, ports.free()[0]
         self.address, self.within, self.context, self.headers = doors or ("127.0.0.1", [], None, {})
         self.folder, self.log = options.folder / name, options.folder / f"{name}.err"
         self.arguments = [f"{options.build}/cbctd", "--listen", f"{self.address}:{self.port}", "--state-dir", str(self.folder), "--backend", "cpu",

@@ -1,8 +1,7 @@
 #!/usr/bin/python3
 """Archives for the tests of sending: one that does wrong, and a look into a real one.
 
-Usage: send.py ports COUNT            free ports
-       send.py web MODE LOG           a DICOMweb archive on a free port, which it prints. MODE: lies (acknowledges, keeps
+Usage: send.py web MODE LOG           a DICOMweb archive on a free port, which it prints. MODE: lies (acknowledges, keeps
            nothing), forgets (keeps every other object), refuses (403 to STOW-RS), slow (a second for each request), drips (a byte of a reply every 0.2 s), drips-late (only of that to STOW-RS), token (401
            without the token "secret-token", keeps all). LOG: a line for each request
        send.py whose DIRECTORY JOBS   every object of the directory (files of DICOM) has the patient of its job; JOBS: a line
@@ -13,19 +12,11 @@ import collections
 import json
 import os
 import re
-import socket
 import sys
 import threading
 import time
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Dict, List
-
-
-def ports(count: int) -> None:
-    ends = [socket.socket() for _ in range(count)]
-    for end in ends:
-        end.bind(("127.0.0.1", 0))
-    print(*[end.getsockname()[1] for end in ends])
 
 
 class Archive(BaseHTTPRequestHandler):
@@ -115,9 +106,7 @@ def whose(directory: str, jobs: str) -> None:
         print(k, len(found[job]), "again: " + str(again) if again else "")
 
 
-if sys.argv[1] == "ports":
-    ports(int(sys.argv[2]))
-elif sys.argv[1] == "web":
+if sys.argv[1] == "web":
     web(*sys.argv[2:4])
 else:
     whose(*sys.argv[2:4])

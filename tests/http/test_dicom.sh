@@ -172,10 +172,7 @@ test_an_archive_takes_them_and_gives_back_the_same() {
 	done
 	plugin=$(ls /usr/share/orthanc/plugins/libOrthancDicomWeb.so 2>/dev/null) || skip "the plugin of the package orthanc-dicomweb is not here"
 	mkdir -p "$work/archive"
-	read -r web dimse < <("$python" -c 'import socket
-ends = [socket.socket() for _ in range(2)]
-for end in ends: end.bind(("127.0.0.1", 0))
-print(*[end.getsockname()[1] for end in ends])')
+	read -r web dimse < <("$python" "$top/tests/http/ports.py" 2)
 	jq -n --arg plugin "$plugin" --arg work "$work/archive" --arg aet $aet --argjson web "$web" --argjson dimse "$dimse" '{Name: $aet, DicomAet: $aet,
 		DicomPort: $dimse, HttpPort: $web, HttpBindAddresses: ["127.0.0.1"], RemoteAccessAllowed: false, AuthenticationEnabled: false,
 		StorageDirectory: $work, IndexDirectory: $work, Plugins: [$plugin], DicomModalities: {}, DicomAlwaysAllowFind: true,

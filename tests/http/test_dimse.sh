@@ -186,7 +186,7 @@ test_todays_patients_come_from_the_worklist() {
 
 # start_system: a department's system that knows of no steps; what it is told is in $work/steps
 start_system() {
-	[ -n "${ris:-}" ] || ris=$("$python" "$top/tests/http/send.py" ports 1)
+	[ -n "${ris:-}" ] || ris=$("$python" "$top/tests/http/ports.py" 1)
 	"$python" "$top/tests/http/steps.py" "$ris" "$work/steps" >>"$work/system.log" 2>&1 &
 	system=$!
 	echo $system >>"$work/peers"
@@ -312,7 +312,7 @@ xa() {
 test_a_run_that_is_received_is_a_scan() {
 	local again one=(who:0010,0020,LO=4711 who:0020,000d,UI=1.2.3 who:0008,0050,SH=A17 who:0020,000e,UI=1.2.3.5)
 	need_dcmtk
-	[ -n "${commit:-}" ] || read -r web dimse commit < <("$python" "$top/tests/http/send.py" ports 3)
+	[ -n "${commit:-}" ] || read -r web dimse commit < <("$python" "$top/tests/http/ports.py" 3)
 	jq -n --argjson listen "$(listening ', "receive": {"url": "unix:'"$work"'/sock", "quiet_s": 0.3, "import": {"air": 50000, "source-to-isocentre": 600}}')" \
 		'{listen: $listen, destinations: []}' >"$work/destinations.json"
 	start_daemon --listen "unix:$work/sock" --destinations "$work/destinations.json"
@@ -376,7 +376,7 @@ test_a_run_that_is_received_is_a_scan() {
 test_mistakes_in_the_file_of_destinations_are_refused() {
 	local good bad pointer pid
 	need_dcmtk
-	[ -n "${commit:-}" ] || read -r web dimse commit < <("$python" "$top/tests/http/send.py" ports 3)
+	[ -n "${commit:-}" ] || read -r web dimse commit < <("$python" "$top/tests/http/ports.py" 3)
 	good=$(jq -nc --argjson listen "$(listening ', "receive": {"url": "unix:/sock", "import": {"air": 5}, "job": {"fdk": {}, "send": ["a"]}}')" '{title: "CBCTD", listen: $listen,
 		worklist: {host: "ris.example", port: 104, title: "RIS"}, destinations: [{name: "a", kind: "dimse", host: "127.0.0.1", port: 9, title: "A"},
 		{name: "b", kind: "dicomweb", url: "http://127.0.0.1:9"}]}')
@@ -426,7 +426,7 @@ test_mistakes_in_the_file_of_destinations_are_refused() {
 test_idle_connections_shut_nobody_out() {
 	local k
 	need_dcmtk
-	[ -n "${commit:-}" ] || read -r web dimse commit < <("$python" "$top/tests/http/send.py" ports 3)
+	[ -n "${commit:-}" ] || read -r web dimse commit < <("$python" "$top/tests/http/ports.py" 3)
 	jq -n --argjson listen "$(listening)" '{listen: $listen, destinations: []}' >"$work/destinations.json"
 	start_daemon --destinations "$work/destinations.json"
 	until grep -q "listening for DICOM" "$work/cbctd.err"; do sleep 0.05; done

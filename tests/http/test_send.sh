@@ -169,7 +169,7 @@ test_what_cannot_be_sent_is_refused_or_told() {
 	send '{"to": "other"}'
 	expect_problem 422 /to
 	# A rule for jobs that nobody has told how their patient lies: the job is made, the sending fails and says why.
-	destinations '{"name": "pacs", "kind": "dicomweb", "url": "http://127.0.0.1:'$("$python" "$top/tests/http/send.py" ports 1)'", "send": "last"}'
+	destinations '{"name": "pacs", "kind": "dicomweb", "url": "http://127.0.0.1:'$("$python" "$top/tests/http/ports.py" 1)'", "send": "last"}'
 	kill -HUP "$(cat "$work/daemon.pid")"
 	until req GET /v1/destinations && member '.destinations[0].send == "last"' "$body" >/dev/null; do sleep 0.05; done
 	job_of null
