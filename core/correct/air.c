@@ -3,6 +3,7 @@
 
 #include <math.h>
 #include <stdbool.h>
+#include <stddef.h>
 
 enum { LOOKED_AT = 64 }; /* rows */
 
@@ -34,7 +35,24 @@ static float mean_of(const float *p, int count)
 	return good > 0 ? sum / (float)good : NAN;
 }
 
-float air_level(const float *view, int columns, int rows, int edge, float largest)
+/* The means of the first two places and of the last two, over the rows in which all are good. */
+static void means_of_ends(float means[][4], int rows, float ret_ends[2])
+{
+	for (int end = 0; end < 2; end++) {
+		float sum = 0;
+		int good = 0;
+
+		for (int i = 0; i < rows; i++) {
+			const float mean = 0.5f * (means[i][2 * end] + means[i][2 * end + 1]);
+
+			sum += isnan(mean) ? 0 : mean;
+			good += !isnan(mean);
+		}
+		ret_ends[end] = good > 0 ? sum / (float)good : 0;
+	}
+}
+
+float air_level(const float *view, int columns, int rows, int edge, float largest, float ret_ends[2])
 {
 	const int looked_at = rows < LOOKED_AT ? rows : LOOKED_AT,
 		  places[] = {0, edge, columns - 2 * edge, columns - edge};
@@ -66,5 +84,9 @@ float air_level(const float *view, int columns, int rows, int edge, float larges
 			same = same && fabsf(means[i][k] - sum) <= near;
 		agree += same;
 	}
-	return (float)agree >= NEARLY_ALL * (float)looked_at ? sum : 0;
+	if ((float)agree < NEARLY_ALL * (float)looked_at)
+		return 0;
+	if (ret_ends != NULL)
+		means_of_ends(means, looked_at, ret_ends);
+	return sum;
 }

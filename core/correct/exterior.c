@@ -133,7 +133,7 @@ static struct exterior_rows look_at_rows(const struct exterior_volume_options *o
 	const struct geometry *geometry = options->geometry;
 	const int columns = geometry->columns, rows = geometry->rows;
 	const float largest = truncation_largest(measured, columns, rows, 1, (size_t)columns);
-	const float air = air_level(measured, columns, rows, truncation_edge(columns), largest);
+	const float air = air_level(measured, columns, rows, truncation_edge(columns), largest, NULL);
 	const struct outside_rows outside =
 	    outside_rows(options->grid, &geometry->views[view], columns, rows, measured);
 	const struct ends_known known = {options->orbit->pad, options->dense, view};
@@ -258,7 +258,7 @@ int exterior_subtract(const struct exterior_volume *exterior, const struct exter
 			    .measured = measured + at,
 			    .largest = largest,
 			    .air = air_level(measured + at, geometry->columns, geometry->rows,
-					     truncation_edge(geometry->columns), largest),
+					     truncation_edge(geometry->columns), largest, NULL),
 			    .explained = explained + at,
 			    .inside = inside != NULL ? inside + at : NULL,
 			    .smooth = smooth,

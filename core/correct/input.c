@@ -287,7 +287,7 @@ static int look_at_air(struct input *input, const void *samples, int columns, in
 			ends[i * wide + c] =
 			    line_integral(input, samples, (size_t)row * (size_t)columns + (size_t)column);
 		}
-	edges->air = air_level(ends, wide, looked_at, edge, largest);
+	edges->air = air_level(ends, wide, looked_at, edge, largest, edges->air_ends);
 	edges->far_off = edges->air != 0 && edges->air >= truncation_level(largest);
 	free(ends);
 	return 0;

@@ -1760,6 +1760,31 @@ START_TEST(a_body_that_is_wholly_seen_is_not_called_cut_off)
 }
 END_TEST
 
+/* Seen along its normal it is as even at both ends of all rows as air would be behind a tube that gives less. */
+START_TEST(a_board_wider_than_the_detector_is_no_dark_air)
+{
+	const double arc = _i ? 205 : 360;
+	const struct orbit_spec spec = {64, 24, 90, {620, 1100, {5, 5}, {0, 0}, {0, 0}}, 20, arc / 90};
+	struct ellipsoid parts[] = {
+	    {.shape = SHAPE_ELLIPSOID, .semi_axes = {45, 40, 60}, .density = 0.02},
+	    {.shape = SHAPE_BOX, .semi_axes = {190, 5, 200}, .centre = {0, 60, 0}, .density = 0.01},
+	};
+	struct phantom phantom = {.count = 2, .parts = parts};
+	struct grid grid = grid_of(16, 16, 4, 4, 4, 4);
+	struct recipe recipe = recipe_on(&grid);
+	struct outcome outcome = {0};
+	struct scene scene;
+
+	scene_orbit(&scene, &spec);
+	scene_add(&scene, &phantom);
+	recipe.fdk.on = true;
+	run(&scene, &recipe, &outcome);
+	ck_assert_msg(strstr(outcome.warnings, "air_level: ") == NULL, "%s", outcome.warnings);
+	outcome_clear(&outcome);
+	scene_clear(&scene);
+}
+END_TEST
+
 /* A skull with a pixel or two of air at its sides, and one whose outline lies in the outermost pixel. */
 START_TEST(a_skull_with_air_beside_it_is_not_called_cut_off)
 {
@@ -2322,6 +2347,7 @@ Suite *recon_suite(void)
 	suite_add_tcase(suite, images);
 
 	tcase_add_loop_test(truncation, truncation_leaves_no_rim_in_fdk_or_sart, 0, 5);
+	tcase_add_loop_test(truncation, a_board_wider_than_the_detector_is_no_dark_air, 0, 2);
 	tcase_add_loop_test(truncation, a_skull_with_air_beside_it_is_not_called_cut_off, 0, 3);
 	tcase_add_loop_test(truncation, a_body_that_is_wholly_seen_is_not_called_cut_off, 0, COUNT(whole));
 	tcase_add_loop_test(truncation, sart_alone_tells_of_truncation, 0, 2);
