@@ -13,6 +13,12 @@ enum { AROUND = 10, USUAL_LEAST = 4, VIEWS_LEAST = 24, PIECES_MOST = 96, PIXELS_
 static const double CUT = 5, SMALLEST_CUT = 1.5, JOINS = 3, OFF = 6, FITS = 3;
 static const double BETTER = 4; /* times a single view fits better elsewhere */
 static const double SURE = 2;   /* times as much where no other one's place is free for it */
+/*
+ * Times, squares: what a run that was stored backwards cuts the ring by at its sides, beside what it leaves there when
+ * it is turned about, and beside all other cuts in it and within some places of it.
+ */
+static const double PLAIN = 10, ALONE = 3;
+enum { FLANK = 4 };
 enum { TRIES = 16 };
 enum { MOST = 2 }; /* one view in so many */
 
@@ -221,11 +227,11 @@ static bool joins(const struct search *search, int before, int behind, int place
 	return apart_of(search, search->views[before], search->views[behind]) <= JOINS * search->usual[place];
 }
 
-static void turn_about(const struct search *search, const struct piece *piece)
+static void turn_about(const struct search *search, int first, int end)
 {
 	const int all = search->ring->count;
 
-	for (int i = piece->first, k = piece->end - 1; i < k; i++, k--) {
+	for (int i = first, k = end - 1; i < k; i++, k--) {
 		const int view = search->views[i % all];
 
 		search->views[i % all] = search->views[k % all];
@@ -264,7 +270,7 @@ static int turn_backward_ones(const struct search *search, const struct piece *p
 		return 0;
 	for (int p = 0; p < count; p++)
 		if (backward[p])
-			turn_about(search, &pieces[p]);
+			turn_about(search, pieces[p].first, pieces[p].end);
 	return moved;
 }
 
@@ -299,6 +305,69 @@ static double next_cut(const struct search *search, double cut)
 	return next * (1 - 1e-9);
 }
 
+/* The cut from a place to the next one where it is plain, and what is left of it with two other views there; false: it
+ * is no such cut. Where a gap in the scan follows it there is none. */
+static bool is_plain(const struct search *search, int place, int before, int behind, double *ret_cut)
+{
+	const double cut = search->apart[place];
+
+	*ret_cut = INFINITY;
+	if (is_fixed(search->ring, place))
+		return true;
+	*ret_cut = cut;
+	return cut > CUT * search->usual[place] &&
+	       PLAIN * apart_of(search, search->views[before], search->views[behind]) <= cut;
+}
+
+/* True if the ring has no gap and no cut at a place that is one beside that. */
+static bool is_quiet(const struct search *search, int place, double cut)
+{
+	const int at = place % search->ring->count;
+
+	return !is_fixed(search->ring, at) && ALONE * search->apart[at] <= cut;
+}
+
+/*
+ * True if the views behind a place up to another one were stored backwards: both sides are plainly cut, all but nothing
+ * of that is left when they are turned about, and nothing else in them and near by is cut like that, as where something
+ * comes and goes, or where runs are exchanged. At an end of the scan there is one side.
+ */
+static bool is_backward_run(const struct search *search, int before, int last)
+{
+	const int all = search->ring->count, first = (before + 1) % all, behind = (last + 1) % all;
+	const int length = (last - before + all) % all;
+	double cuts[2], least;
+
+	if (length < 2 || MOST * length > all || (is_fixed(search->ring, before) && is_fixed(search->ring, last)) ||
+	    !is_plain(search, before, before, last, &cuts[0]) || !is_plain(search, last, first, behind, &cuts[1]))
+		return false;
+	least = fmin(cuts[0], cuts[1]);
+	for (int k = 1; k < length; k++)
+		if (!is_quiet(search, before + k, least))
+			return false;
+	/* What lies beyond a gap in the scan is not near by. */
+	for (int k = 0; k < FLANK && !is_fixed(search->ring, (before - k + all) % all); k++)
+		if (k > 0 && !is_quiet(search, before - k + all, least))
+			return false;
+	for (int k = 0; k < FLANK && !is_fixed(search->ring, (last + k) % all); k++)
+		if (k > 0 && !is_quiet(search, last + k, least))
+			return false;
+	return true;
+}
+
+static void turn_backward_runs(const struct search *search)
+{
+	const int all = search->ring->count;
+
+	for (int before = 0; before < all; before++)
+		for (int length = 2; MOST * length <= all; length++)
+			if (is_backward_run(search, before, (before + length) % all)) {
+				turn_about(search, before + 1, before + length + 1);
+				before += length;
+				break;
+			}
+}
+
 /* Where views far from each other look alike, a cut between them is small: smaller ones are added one by one. */
 static void find_order(const struct search *search)
 {
@@ -319,6 +388,8 @@ static void find_order(const struct search *search)
 			return;
 		size = next_cut(search, size);
 	}
+	if (cut)
+		turn_backward_runs(search);
 }
 
 /* ---- single views ---- */

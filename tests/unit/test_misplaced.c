@@ -32,6 +32,10 @@ static const struct {
     {.step = 3.5, .plate = .3},
     {.backward = {6, 21}, .step = 6, .mended = 6},
     {.backward = {5, 40}, .step = 3.5, .mended = 4}, /* the middle one is where it belongs */
+    {.backward = {6, 0}, .step = 3.5, .mended = 6},  /* at the ends of an arc */
+    {.backward = {9, 51}, .step = 3.5, .mended = 8},
+    {.backward = {9, 10}, .step = 6, .mended = 8, .plate = .05}, /* the object cuts the ring, too */
+    {.backward = {12, 40}, .step = 6, .mended = 12, .plate = .05},
 };
 enum { ROWS_OF_TEST = sizeof(rows) / sizeof(rows[0]) };
 
