@@ -222,8 +222,8 @@ int recon_open(const struct backend *backend, struct device *device, const struc
 	if (code == 0)
 		code = open_rim(recon, err);
 	if (code == 0 && recipe_has_restraint(&recon->recipe))
-		code = restraint_new(&recon->recipe.grid, recon->recipe.mu_water, recon->recipe.iterate.nonnegative,
-				     &recon->restraint, err);
+		code = restraint_new(&recon->recipe.grid, recon->recipe.mu_water, recon->orbit.pixel_at_isocentre[0],
+				     recon->recipe.iterate.nonnegative, &recon->restraint, err);
 	if (code == 0 && recon->recipe.algorithm != NULL)
 		code = alternation_new(&recon->recipe.grid, recon->geometry, recon->recipe.mu_water,
 				       &recon->alternation, err);

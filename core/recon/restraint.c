@@ -5,16 +5,18 @@
 #include <stdlib.h>
 #include <string.h>
 
+#include "core/recon/restraint_places.h"
+
 /* Voxels a side of a cube; so many cubes say something. */
-enum { CELL = 4, CELLS_LEAST = 16 };
+enum { CELL = PLACE_CELL, CELLS_LEAST = 16 };
 /* Layers of cubes that are asked for their roughness, at most: the others are left out evenly. */
 enum { LAYERS_MOST = 24 };
 /* c beside the volume there, in thousandths; and the noise that values differ by anyway, for a, HU. */
 static const double FLOOR = 4, EVEN = 30;
 /* Shares of water: the object, and what is too bright for bone. */
 static const double OBJECT = 0.7, BRIGHT = 2.6;
-/* w from which on the iterate stays as it is, and up to which it becomes S. */
-static const double WHOLE = 0.85, NONE = 0.2;
+/* The share of even voxels in places that iterations make rougher, from which on places are told apart in any case. */
+static const double MOST = 2.0 / 3;
 /* What TV took, HU, that is nothing; times the rest of it, that an iterate gets back at most; and what is told. */
 static const double LITTLE = 10, LOST = 3, TOLD = 25;
 /* HU of a step of `limit`. */
@@ -33,13 +35,14 @@ struct node {
 
 struct restraint {
 	struct grid grid;
-	double mu_water;
+	double mu_water, blur; /* 1/mm; of FDK, mm */
 	bool nonnegative;
 	int cells[3];
 	size_t slice, voxels;
 	float *start;       /* [z][y][x], S, owned; in between what TV took; NULL before either is known */
 	signed char *limit; /* [z][y][x], behind start: what an iterate gets back at most, with its sign */
 	bool lost, begun;   /* TV took something; S is there */
+	bool metal;         /* S has voxels as dense as metal */
 	bool holds_dense;   /* what is very dense stays as S has it */
 };
 
@@ -66,11 +69,11 @@ size_t restraint_bytes(const struct grid *grid)
 	if (grid->size[0] < 4 * CELL || grid->size[1] < 4 * CELL || grid->size[2] < CELL)
 		return 0;
 	return restraint_kept_bytes(grid) + cells_of(grid) * (sizeof(struct cell) + sizeof(float)) +
-	       nodes_of(grid) * sizeof(struct node) + 2 * slice * sizeof(float);
+	       nodes_of(grid) * sizeof(struct node) + 2 * slice * sizeof(float) + places_bytes(grid);
 }
 
-int restraint_new(const struct grid *grid, double mu_water, bool nonnegative, struct restraint **ret_restraint,
-		  struct error *err)
+int restraint_new(const struct grid *grid, double mu_water, double blur, bool nonnegative,
+		  struct restraint **ret_restraint, struct error *err)
 {
 	struct restraint *restraint;
 
@@ -83,6 +86,7 @@ int restraint_new(const struct grid *grid, double mu_water, bool nonnegative, st
 	*restraint = (struct restraint){
 	    .grid = *grid,
 	    .mu_water = mu_water,
+	    .blur = blur,
 	    .nonnegative = nonnegative,
 	    .cells = {grid->size[0] / CELL, grid->size[1] / CELL, grid->size[2] / CELL},
 	    .slice = (size_t)grid->size[0] * (size_t)grid->size[1],
@@ -366,6 +370,17 @@ int restraint_see_loss(struct restraint *restraint, const struct backend *backen
 	return code;
 }
 
+static void look_for_metal(struct restraint *restraint)
+{
+	const float metal = (float)(RESTRAINT_METAL * restraint->mu_water);
+	bool found = false;
+
+#pragma omp parallel for schedule(static) reduction(|| : found)
+	for (size_t i = 0; i < restraint->voxels; i++)
+		found = found || restraint->start[i] >= metal;
+	restraint->metal = found;
+}
+
 int restraint_begin(struct restraint *restraint, const struct backend *backend, struct volume *volume,
 		    struct error *err)
 {
@@ -383,6 +398,8 @@ int restraint_begin(struct restraint *restraint, const struct backend *backend, 
 		}
 	}
 	restraint->begun = code == 0;
+	if (restraint->begun)
+		look_for_metal(restraint);
 	free(slice);
 	return code;
 }
@@ -408,6 +425,7 @@ int restraint_resume(struct restraint *restraint, const char *bytes, struct erro
 	memcpy(restraint->start, bytes, restraint_kept_bytes(&restraint->grid));
 	for (size_t i = 0; i < restraint->voxels && !restraint->lost; i++)
 		restraint->lost = restraint->limit[i] != 0;
+	look_for_metal(restraint);
 	restraint->begun = true;
 	return 0;
 }
@@ -474,15 +492,13 @@ static float given_back(float taken, float limit)
 	return limit > 0 ? fminf(fmaxf(taken, 0), limit) : fmaxf(fminf(taken, 0), limit);
 }
 
-/* V' of a slice in place; nodes NULL: its means stay. */
-static void restrain_slice(const struct restraint *restraint, const struct node *nodes, int z, float *values,
-			   size_t counts[2], struct restraint_report *report)
+/* What a slice gets back of its means, in place. */
+static void give_back(const struct restraint *restraint, const struct node *nodes, int z, float *values,
+		      size_t counts[2], struct restraint_report *report)
 {
 	const int columns = restraint->grid.size[0], rows = restraint->grid.size[1];
 	const float step = (float)(STEP * restraint->mu_water / 1000), object = (float)(OBJECT * restraint->mu_water);
-	const float told = (float)(TOLD * restraint->mu_water / 1000), share = (float)report->share;
-	const float dense = restraint->holds_dense ? (float)(RESTRAINT_METAL * restraint->mu_water) : INFINITY;
-	const float *start = restraint->start + (size_t)z * restraint->slice;
+	const float told = (float)(TOLD * restraint->mu_water / 1000);
 	const signed char *limit = restraint->limit + (size_t)z * restraint->slice;
 	size_t inside = 0, back = 0;
 	float most = 0;
@@ -491,32 +507,106 @@ static void restrain_slice(const struct restraint *restraint, const struct node 
 	for (int y = 0; y < rows; y++)
 		for (int x = 0; x < columns; x++) {
 			const size_t at = (size_t)y * (size_t)columns + (size_t)x;
-			float value = values[at];
 
-			if (nodes != NULL && limit[at] != 0) {
-				const float taken = taken_at(restraint, nodes, x, y, z, value);
+			if (limit[at] != 0) {
+				const float taken = taken_at(restraint, nodes, x, y, z, values[at]);
 				const float given = given_back(taken, step * (float)limit[at]);
 
-				value += given;
-				back += fabsf(given) > told && value >= object;
+				values[at] += given;
+				back += fabsf(given) > told && values[at] >= object;
 				most = fmaxf(most, fabsf(given));
 			}
-			inside += value >= object;
-			if (start[at] >= dense)
-				value = start[at];
-			else if (share < 1)
-				value = start[at] + share * (value - start[at]);
-			values[at] = restraint->nonnegative ? fmaxf(value, 0) : value;
+			inside += values[at] >= object;
 		}
 	counts[0] += inside;
 	counts[1] += back;
 	report->most = fmax(report->most, (double)most);
 }
 
-/* w, or less of it the nearer it is to NONE; 1 from WHOLE on. */
-static double kept_share(double share)
+/* V' of a slice in place, once it has its means. */
+static void hold_back(const struct restraint *restraint, struct places *places, double most, int z, float *values)
 {
-	return share >= WHOLE ? 1 : fmax(0, fmin(share, (share - NONE) / (WHOLE - NONE)));
+	const float dense = restraint->holds_dense ? (float)(RESTRAINT_METAL * restraint->mu_water) : INFINITY;
+	const float *start = restraint->start + (size_t)z * restraint->slice, share = places != NULL ? 1 : (float)most;
+
+	if (places != NULL)
+		places_restrain(places, z, most, start, values);
+#pragma omp parallel for schedule(static)
+	for (size_t at = 0; at < restraint->slice; at++) {
+		float value = values[at];
+
+		if (start[at] >= dense)
+			value = start[at];
+		else if (share < 1)
+			value = start[at] + share * (value - start[at]);
+		values[at] = restraint->nonnegative ? fmaxf(value, 0) : value;
+	}
+}
+
+/* Volumes that are shown, and what is worked in. */
+struct showing {
+	const struct backend *backend;
+	struct volume *volume;
+	const struct node *nodes; /* NULL: its means stay */
+	float *slice;
+	size_t counts[2]; /* voxels of the object, and those that got back much */
+};
+
+static int read_slice(const struct restraint *restraint, struct showing *showing, int z,
+		      struct restraint_report *report, struct error *err)
+{
+	int code = showing->backend->volume_download(showing->volume, z, 1, showing->slice, err);
+
+	if (code == 0 && showing->nodes != NULL)
+		give_back(restraint, showing->nodes, z, showing->slice, showing->counts, report);
+	return code;
+}
+
+/* Asks the places of every `step`-th layer of cubes. */
+static int ask_places(const struct restraint *restraint, struct showing *showing, struct places *places, int step,
+		      double *ret_rougher, struct error *err)
+{
+	struct restraint_report unused = {0};
+	struct showing asked = *showing;
+	int code = 0;
+
+	places_begin(places);
+	for (int k = 0; k < restraint->cells[2]; k += step)
+		for (int z = k * CELL; z < (k + 1) * CELL && code == 0; z++) {
+			code = read_slice(restraint, &asked, z, &unused, err);
+			if (code == 0)
+				places_add(places, z, restraint->start + (size_t)z * restraint->slice, asked.slice);
+		}
+	if (code == 0)
+		*ret_rougher = places_finish(places);
+	return code;
+}
+
+/* *ret_places stays NULL where places are not told apart. */
+static int find_places(const struct restraint *restraint, struct showing *showing, struct restraint_report *report,
+		       struct places **ret_places, struct error *err)
+{
+	const int step = (restraint->cells[2] - 1) / LAYERS_MOST + 1;
+	bool wanted = restraint->metal || restraint->holds_dense || report->share < 1;
+	struct places *places;
+	double rougher = 0;
+	int code = places_new(&restraint->grid, restraint->mu_water, restraint->blur, &places, err);
+
+	if (code == 0)
+		code = ask_places(restraint, showing, places, wanted ? 1 : step, &rougher, err);
+	if (code == 0 && !wanted && rougher > MOST) {
+		wanted = true;
+		code = step > 1 ? ask_places(restraint, showing, places, 1, &rougher, err) : 0;
+	}
+	if (code < 0 || !wanted) {
+		places_free(places);
+		return code;
+	}
+	report->changed = true;
+	report->places = true;
+	report->rougher = rougher;
+	*ret_places = places;
+	return 0;
 }
 
 int restraint_show(struct restraint *restraint, const struct backend *backend, struct volume *volume, bool holds_dense,
@@ -526,31 +616,36 @@ int restraint_show(struct restraint *restraint, const struct backend *backend, s
 	struct restraint_report report = {.share = 1};
 	struct scratch scratch;
 	struct pair pair = {backend, volume, NULL, NULL};
-	size_t counts[2] = {0, 0};
+	struct showing showing = {.backend = backend, .volume = volume};
+	struct places *places = NULL;
 	int code = restraint->begun ? scratch_new(restraint, &scratch, err) : 0;
 
 	*ret_report = report;
 	if (code < 0 || !restraint->begun)
 		return code;
-	pair.slices = scratch.slices;
+	pair.slices = showing.slice = scratch.slices;
 	code = add_layers(restraint, &pair, step, scratch.cells, err);
 	if (code == 0)
 		find_share(restraint, scratch.cells, scratch.scores, &report);
-	report.share = kept_share(report.share);
+	report.share = places_kept(report.share);
 	report.changed = report.share < 1 || restraint->lost || holds_dense;
 	restraint->holds_dense = holds_dense;
-	if (code == 0 && restraint->lost)
+	if (code == 0 && restraint->lost) {
 		make_nodes(restraint, scratch.cells, scratch.nodes);
-	for (int z = 0; z < restraint->grid.size[2] && code == 0 && report.changed; z++) {
-		code = backend->volume_download(volume, z, 1, scratch.slices, err);
-		if (code == 0)
-			restrain_slice(restraint, restraint->lost ? scratch.nodes : NULL, z, scratch.slices, counts,
-				       &report);
-		if (code == 0)
-			code = backend->volume_put(volume, z, 1, scratch.slices, err);
+		showing.nodes = scratch.nodes;
 	}
+	if (code == 0)
+		code = find_places(restraint, &showing, &report, &places, err);
+	for (int z = 0; z < restraint->grid.size[2] && code == 0 && report.changed; z++) {
+		code = read_slice(restraint, &showing, z, &report, err);
+		if (code == 0) {
+			hold_back(restraint, places, report.share, z, showing.slice);
+			code = backend->volume_put(volume, z, 1, showing.slice, err);
+		}
+	}
+	places_free(places);
 	scratch_free(&scratch);
-	report.restored = counts[0] > 0 ? (double)counts[1] / (double)counts[0] : 0;
+	report.restored = showing.counts[0] > 0 ? (double)showing.counts[1] / (double)showing.counts[0] : 0;
 	if (code == 0)
 		*ret_report = report;
 	return code;

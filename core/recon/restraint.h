@@ -19,6 +19,11 @@
  * without anything dense .99 and more. From .85 on nothing is changed, and below it V' has w or, if that is less,
  * (w - .2) / .65, for the quietest quarter shows less of the streaks than the rest.
  *
+ * Places. One w holds edges back with the streaks, or lets streaks of some places pass with the rest. So where S has
+ * voxels as dense as metal, where w is below .85, and where two thirds of the even voxels lie in places that are
+ * rougher in V than in S, V' has a w of each place, w(x) (core/recon/restraint_places.h). No other scan is touched by
+ * that.
+ *
  * Means. Beside metal the volume of few photons is so noisy that TV takes bone with the noise: 800 HU become 660. In
  * such a scan S is not FDK's volume T after TV, but that with what TV took of its means, g(T, F - T), F being FDK's
  * before TV:
@@ -40,8 +45,10 @@ struct restraint;
 
 struct restraint_report {
 	bool changed;
-	double share;          /* w, 1 where all of the change is kept */
-	double rough[2];       /* of S and V in the quietest quarter, 1/mm, root mean square of h */
+	double share;    /* W, 1 where all of the change is kept */
+	bool places;     /* were told apart */
+	double rougher;  /* the share of even voxels where V is rougher than S; 0 where places are not told apart */
+	double rough[2]; /* of S and V in the quietest quarter, 1/mm, root mean square of h */
 	double restored, most; /* share of the object that got back more than 25 HU; the most, 1/mm */
 };
 
@@ -51,8 +58,9 @@ struct restraint_report {
 
 /* Bytes of the host's memory, once it has begun; 0: restraint_new makes nothing, the grid has too few voxels. */
 size_t restraint_bytes(const struct grid *grid);
-int restraint_new(const struct grid *grid, double mu_water, bool nonnegative, struct restraint **ret_restraint,
-		  struct error *err);
+/* blur: the width of FDK's, mm. */
+int restraint_new(const struct grid *grid, double mu_water, double blur, bool nonnegative,
+		  struct restraint **ret_restraint, struct error *err);
 void restraint_free(struct restraint *restraint); /* NULL is fine */
 
 /* Notes what TV took of FDK's means. Before restraint_begin. */

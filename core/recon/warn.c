@@ -229,14 +229,15 @@ void warn_settled(const struct warning_sink *sink, const struct recipe *recipe, 
 
 void warn_restraint(const struct warning_sink *sink, const struct recipe *recipe, const struct restraint_report *report)
 {
-	const double hu = recipe->mu_water / 1000, much = 0.01;
+	const double hu = recipe->mu_water / 1000, much = 0.01, most = 2.0 / 3;
 
-	if (report->share < 1)
+	if (report->share < 1 || report->rougher > most)
 		warning_tell(sink, "iterations_held_back",
 			     "in the quietest quarter of the object neighbouring voxels differ by %.3g HU before the "
-			     "iterations and by %.3g HU after them: kept volumes have %.0f %% of what the iterations "
-			     "changed",
-			     report->rough[0] / hu, report->rough[1] / hu, 100 * report->share);
+			     "iterations and by %.3g HU after them, and %.0f %% of even tissue becomes rougher: kept "
+			     "volumes have %.0f %% of what the iterations changed, and of each even place what "
+			     "leaves it the least rough",
+			     report->rough[0] / hu, report->rough[1] / hu, 100 * report->rougher, 100 * report->share);
 	if (report->restored > much)
 		warning_tell(sink, "noise_beside_metal",
 			     "smoothing moved the means of %.3g %% of the object by more than 25 HU beside FDK's: "
