@@ -120,8 +120,10 @@ static float evenness(const struct places *places, const float *start, int x, in
 	for (int axis = 0; axis < 2; axis++)
 		for (int i = -places->reach[axis]; i <= places->reach[axis]; i++)
 			if (at[axis] + i >= 0 && at[axis] + i < size[axis]) {
-				low = fminf(low, here[i * stride[axis]]);
-				high = fmaxf(high, here[i * stride[axis]]);
+				const float value = here[i * stride[axis]];
+
+				low = value < low ? value : low;
+				high = value > high ? value : high;
 			}
 	return fminf(fmaxf(2 - (high - low) / unit, 0), 1);
 }
@@ -231,29 +233,34 @@ static int between(int voxel, int cells, float *ret_share)
 	return first;
 }
 
-static void place_at(const struct places *places, int x, int y, int z, float ret[2])
+/* w and s^2 of a line of cubes along x, at the height of a line of voxels. */
+struct line {
+	float of[GRID_SIZE_MAX / CELL][2];
+};
+
+static void line_at(const struct places *places, int y, int z, struct line *ret)
 {
-	const int *count = places->cells, at[3] = {x, y, z};
-	const size_t along[3] = {1, (size_t)count[0], (size_t)count[0] * (size_t)count[1]};
-	float share[3];
-	size_t first = 0;
+	const int *count = places->cells;
+	float share[2];
+	const int row = between(y, count[1], &share[0]), layer = between(z, count[2], &share[1]);
 
-	ret[SHARE] = ret[SPREAD] = 0;
-	for (int axis = 0; axis < 3; axis++)
-		first += along[axis] * (size_t)between(at[axis], count[axis], &share[axis]);
-	for (int corner = 0; corner < 8; corner++) {
-		size_t cube = first;
-		float weight = 1;
+	memset(ret->of, 0, (size_t)count[0] * sizeof(ret->of[0]));
+	for (int corner = 0; corner < 4; corner++) {
+		const int j = row + (corner & 1), k = layer + (corner >> 1);
+		const float weight = (corner & 1 ? share[0] : 1 - share[0]) * (corner >> 1 ? share[1] : 1 - share[1]);
+		const struct place *line = places->near + ((ptrdiff_t)k * count[1] + j) * count[0];
 
-		for (int axis = 0; axis < 3; axis++) {
-			const bool second = corner >> axis & 1;
-
-			cube += second && count[axis] > 1 ? along[axis] : 0;
-			weight *= second ? share[axis] : 1 - share[axis];
+		for (int i = 0; i < count[0] && weight > 0; i++) {
+			ret->of[i][SHARE] += weight * line[i].of[SHARE];
+			ret->of[i][SPREAD] += weight * line[i].of[SPREAD];
 		}
-		ret[SHARE] += weight * places->near[cube].of[SHARE];
-		ret[SPREAD] += weight * places->near[cube].of[SPREAD];
 	}
+}
+
+static float along_line(const struct line *line, int first, float share, int what)
+{
+	return share > 0 ? (1 - share) * line->of[first][what] + share * line->of[first + 1][what]
+			 : line->of[first][what];
 }
 
 /* Means of the squares of V - S over a few voxels, along x and then along y; outer ones over those that are there. */
@@ -297,16 +304,21 @@ void places_restrain(struct places *places, int z, double most, const float *sta
 	const float *squares = means_of_squares(places, start, values);
 
 #pragma omp parallel for schedule(static)
-	for (int y = 0; y < rows; y++)
+	for (int y = 0; y < rows; y++) {
+		struct line line;
+
+		line_at(places, y, z, &line);
 		for (int x = 0; x < columns; x++) {
 			const ptrdiff_t at = (ptrdiff_t)y * columns + x;
 			const float edge = 1 - evenness(places, start, x, y);
-			float place[2], w;
+			float share;
+			const int first = between(x, places->cells[0], &share);
+			const float spread = EDGE * along_line(&line, first, share, SPREAD);
+			float w = along_line(&line, first, share, SHARE);
 
-			place_at(places, x, y, z, place);
-			w = place[SHARE];
-			if (edge > 0 && (float)most > w && squares[at] > EDGE * place[SPREAD])
-				w += edge * (1 - EDGE * place[SPREAD] / squares[at]) * ((float)most - w);
+			if (edge > 0 && (float)most > w && squares[at] > spread)
+				w += edge * (1 - spread / squares[at]) * ((float)most - w);
 			values[at] = start[at] + w * (values[at] - start[at]);
 		}
+	}
 }
