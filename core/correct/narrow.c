@@ -19,8 +19,11 @@ enum { STRIPS_LEAST = 5 };            /* known ones of a band */
 
 static const double PI = 3.14159265358979323846;
 static const double WIDE = 120; /* degrees from one side of a run to the other, at most */
-/* Line integrals. Four columns in a fifth of the views make 10 HU by that, at the edge what an object does is more. */
-static const float LEAST = 0.12f, LEAST_AT_EDGE = 0.25f;
+/*
+ * Line integrals. Four columns in a fifth of the views make 10 HU by the least. What is less than sure is a band that
+ * is darker, and not at the edge: what an object does there is more, and a plate that is away for some views, brighter.
+ */
+static const float LEAST = 0.12f, SURE = 0.25f;
 static const float WITHIN = 0.3f;        /* of the step: how far samples of a band may be off it, */
 static const float NEAR_BY = 0.3f;       /* those next to it off what lies between its sides, */
 static const float FAR_OFF = 0.6f;       /* and as many others off nothing */
@@ -428,7 +431,7 @@ static void find_seeds(const struct change *change, int samples, struct band ret
 			/* Little lies beside it there: what does is no band because that one is. */
 			if (is_at_edge(&band, samples) && mean_between(&sums, first, end) / band.step < 0.5f)
 				continue;
-			if (fabsf(band.step) >= (is_at_edge(&band, samples) ? LEAST_AT_EDGE : LEAST))
+			if (fabsf(band.step) >= (is_at_edge(&band, samples) ? SURE : LEAST))
 				keep_seed(ret_seeds, scores, &band);
 		}
 }
@@ -477,6 +480,8 @@ static int mark(void *context, int before, int last)
 	step.sides[0] = ring_place(ring, before)->view;
 	step.sides[1] = ring_place(ring, (last + 1) % ring->count)->view;
 	step.level = 0.5f * (search->steps[before] - search->steps[last]);
+	if (step.level < 0 && fabsf(marking->band->step) < SURE)
+		return 0;
 	for (int k = 1; k <= run; k++)
 		search->ret_steps[ring_place(ring, (before + k) % ring->count)->view] = step;
 	return run;
