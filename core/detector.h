@@ -12,6 +12,8 @@ enum { SCATTER_KERNELS_MOST = 4, LAG_TERMS_MOST = 4, SCATTER_IMAGE_MOST = 4096 /
 #define SCATTER_POWER_MOST 6
 #define SCATTER_ASYMMETRY_MOST 1
 #define SCATTER_FRACTION_MOST 10
+#define SCATTER_BODY_LEAST 0.001 /* of a body's amplitude */
+#define SCATTER_MULTIPLE_MOST 10
 #define LAG_FRAMES_MOST 10000
 
 /* A Gaussian on the detector that a pencil of the beam makes, see core/correct/scatter.h. */
@@ -29,11 +31,18 @@ struct scatter_images {
 	int columns, rows, every; /* columns 0: there are none */
 };
 
+/* A body of water about the isocentre, as thick as the primary says, which scatters: core/correct/scatter_body.h. */
+struct scatter_body {
+	double amplitude; /* 0: there is none */
+	double multiple;
+};
+
 struct scatter_model {
 	double fraction; /* of the primary behind the densest part, the same all over the detector; 0: kernels */
 	int count;       /* kernels */
 	struct scatter_kernel kernels[SCATTER_KERNELS_MOST];
-	struct scatter_images images; /* in place of both */
+	struct scatter_body body;     /* in place of both */
+	struct scatter_images images; /* in place of all */
 };
 
 /* 0 where there are none. */

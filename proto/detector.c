@@ -104,19 +104,32 @@ static void kernels_read(struct json_reader *reader, struct scatter_model *model
 static void images_read(struct json_reader *reader, struct scatter_images *images)
 {
 	long columns = 0, rows = 0, every = 1;
-	const cJSON *kind = json_member(reader, "kind", false);
 
-	if (kind == NULL)
-		return;
-	if (!cJSON_IsString(kind) || strcmp(kind->valuestring, "images") != 0) {
-		json_fail(reader, ERR_INVALID, "kind",
-			  "\"images\" is expected, or no kind beside kernels or a fraction");
-		return;
-	}
 	json_integer(reader, "columns", true, 1, SCATTER_IMAGE_MOST, &columns);
 	json_integer(reader, "rows", true, 1, SCATTER_IMAGE_MOST, &rows);
 	json_integer(reader, "every", false, 1, VIEWS_MAX, &every);
 	*images = (struct scatter_images){(int)columns, (int)rows, (int)every};
+}
+
+static void body_read(struct json_reader *reader, struct scatter_body *body)
+{
+	json_number(reader, "amplitude", true, SCATTER_BODY_LEAST, SCATTER_AMPLITUDE_MOST, &body->amplitude);
+	json_number(reader, "multiple", true, 0, SCATTER_MULTIPLE_MOST, &body->multiple);
+}
+
+static void kind_read(struct json_reader *reader, struct scatter_model *model)
+{
+	const cJSON *kind = json_member(reader, "kind", false);
+
+	if (kind == NULL)
+		return;
+	if (cJSON_IsString(kind) && strcmp(kind->valuestring, "images") == 0)
+		images_read(reader, &model->images);
+	else if (cJSON_IsString(kind) && strcmp(kind->valuestring, "body") == 0)
+		body_read(reader, &model->body);
+	else
+		json_fail(reader, ERR_INVALID, "kind",
+			  "\"body\" or \"images\" is expected, or no kind beside kernels or a fraction");
 }
 
 void scatter_read(struct json_reader *reader, struct scatter_model *ret_model)
@@ -131,11 +144,12 @@ void scatter_read(struct json_reader *reader, struct scatter_model *ret_model)
 	json_begin(&inner, object, base, reader->err);
 	kernels_read(&inner, ret_model);
 	json_number(&inner, "fraction", false, 0.001, SCATTER_FRACTION_MOST, &ret_model->fraction);
-	images_read(&inner, &ret_model->images);
-	if (inner.code == 0 &&
-	    (ret_model->count > 0) + (ret_model->fraction > 0) + (ret_model->images.columns > 0) != 1)
+	kind_read(&inner, ret_model);
+	if (inner.code == 0 && (ret_model->count > 0) + (ret_model->fraction > 0) + (ret_model->body.amplitude > 0) +
+				       (ret_model->images.columns > 0) !=
+				   1)
 		json_fail(&inner, ERR_INVALID, "",
-			  "either \"kernels\" or a \"fraction\" is expected, or \"images\" as \"kind\"");
+			  "either \"kernels\" or a \"fraction\" is expected, or \"body\" or \"images\" as \"kind\"");
 	entry_end(reader, &inner);
 }
 
@@ -159,6 +173,12 @@ cJSON *scatter_json(const struct scatter_model *model)
 
 	if (model->fraction > 0) {
 		cJSON_AddNumberToObject(object, "fraction", model->fraction);
+		return object;
+	}
+	if (model->body.amplitude > 0) {
+		cJSON_AddStringToObject(object, "kind", "body");
+		cJSON_AddNumberToObject(object, "amplitude", model->body.amplitude);
+		cJSON_AddNumberToObject(object, "multiple", model->body.multiple);
 		return object;
 	}
 	list = cJSON_AddArrayToObject(object, "kernels");

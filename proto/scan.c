@@ -119,7 +119,8 @@ static bool has_scatter(const struct scan *scan)
 {
 	const struct scatter_model *scatter = &scan->scatter;
 
-	return scatter->count > 0 || scatter->fraction > 0 || scatter->images.columns > 0;
+	return scatter->count > 0 || scatter->fraction > 0 || scatter->body.amplitude > 0 ||
+	       scatter->images.columns > 0;
 }
 
 struct linearise scan_linearise(const struct scan *scan)

@@ -24,7 +24,7 @@ struct scan {
 	double hardening[HARDENING_MOST];
 	int hardening_count;          /* coefficients, 0: none */
 	struct lag_model lag;         /* count 0: none */
-	struct scatter_model scatter; /* neither kernels, nor a fraction, nor images: none */
+	struct scatter_model scatter; /* neither kernels, nor a fraction, a body or images: none */
 	struct patient patient;       /* how the patient lies */
 	struct subject subject;       /* who that is, and the study */
 	struct geometry geometry;

@@ -1,4 +1,4 @@
-/* cbct fit-scatter: kernels of scattered radiation from exposures with and without beam stops. */
+/* cbct fit-scatter: kernels or a body of scattered radiation from exposures with and without beam stops. */
 #include <math.h>
 #include <stdlib.h>
 
@@ -9,7 +9,7 @@
 
 struct fit_scatter_options {
 	const char *open, *stopped, *stops, *flat, *dark, *output;
-	double pixel_mm[2];
+	double pixel_mm[2], distances_mm[2];
 	long kernels;
 	struct image_options images;
 };
@@ -24,6 +24,12 @@ static const struct option rows[] = {
     ROW("flat", 0, OPTION_TEXT, flat, "FILE", "nothing in the beam", 0, 0, 0),
     ROW("dark", 0, OPTION_TEXT, dark, "FILE", "no beam; without it 0", 0, 0, 0),
     ROW("pixel-mm", 0, OPTION_EACH, pixel_mm, "N[,N]", "pitch along a row and along a column", 1e-6, 1e4, 2),
+    ROW("distances-mm", 0, OPTION_NUMBERS, distances_mm, "N,N",
+	"from the source to the middle of the objects, and to the detector, whose middle is opposite: a body is fitted "
+	"in "
+	"place of kernels, which holds for larger objects and other distances; from bottles, thick plates that do not "
+	"cover the beam are no such bodies",
+	1e-3, 1e6, 2),
     ROW("kernels", 0, OPTION_INTEGER, kernels, "N",
 	"their number; more than one follow the objects of the fit more closely, and others less", 1,
 	SCATTER_KERNELS_MOST, 0),
@@ -133,12 +139,21 @@ static int exposure_read(const struct setup *setup, int index, float *ret, struc
 	return 0;
 }
 
+static struct scatter_beam beam_of(const struct fit_scatter_options *options, const struct images *images)
+{
+	return (struct scatter_beam){.pixel_mm = {options->pixel_mm[0], options->pixel_mm[1]},
+				     .detector_mm = options->distances_mm[1],
+				     .body_mm = options->distances_mm[0],
+				     .centre = {0.5 * (images->columns - 1), 0.5 * (images->rows - 1)}};
+}
+
 static int fit(const struct fit_scatter_options *options, const struct setup *setup, struct scatter_fit *ret_fit,
 	       struct error *err)
 {
 	const int count = setup->open->count;
 	float *all = malloc(sizeof(*all) * 2 * setup->pixels * (size_t)count);
 	struct scatter_exposure *exposures = malloc(sizeof(*exposures) * (size_t)count);
+	const struct scatter_beam beam = beam_of(options, setup->open);
 	int code = 0;
 
 	if (all == NULL || exposures == NULL)
@@ -150,8 +165,8 @@ static int fit(const struct fit_scatter_options *options, const struct setup *se
 		exposures[i] = (struct scatter_exposure){at, at + setup->pixels};
 	}
 	if (code == 0)
-		code = scatter_fit(exposures, count, setup->open->columns, setup->open->rows, options->pixel_mm,
-				   (int)options->kernels, ret_fit, err);
+		code = scatter_fit(exposures, count, setup->open->columns, setup->open->rows, &beam,
+				   isnan(options->distances_mm[0]) ? (int)options->kernels : 0, ret_fit, err);
 	free(all);
 	free(exposures);
 	return code;
@@ -168,6 +183,8 @@ static int fit_scatter_run(const void *values, struct error *err)
 		return error_set(err, ERR_USAGE, "--flat and --stops are needed");
 	if (isnan(options->pixel_mm[0]))
 		return error_set(err, ERR_USAGE, "--pixel-mm is needed");
+	if (!isnan(options->distances_mm[0]) && !(options->distances_mm[0] < options->distances_mm[1]))
+		return error_set(err, ERR_USAGE, "--distances-mm: the objects are expected before the detector");
 	code = setup_open(options, &setup, err);
 	if (code == 0)
 		code = fit(options, &setup, &result, err);
@@ -183,6 +200,7 @@ static int fit_scatter_run(const void *values, struct error *err)
 
 static const struct fit_scatter_options defaults = {.output = "-",
 						    .pixel_mm = {OPTION_UNSET_NUMBER, OPTION_UNSET_NUMBER},
+						    .distances_mm = {OPTION_UNSET_NUMBER, OPTION_UNSET_NUMBER},
 						    .kernels = 1,
 						    .images = IMAGE_OPTIONS_DEFAULTS};
 static const struct positional positionals[] = {
@@ -193,7 +211,7 @@ static const struct positional positionals[] = {
     {0}};
 
 const struct command command_fit_scatter = {
-    "fit-scatter",  "kernels of scattered radiation from exposures with and without beam stops",
+    "fit-scatter",  "kernels or a body of scattered radiation from exposures with and without beam stops",
     positionals,    groups,
     &defaults,      sizeof(defaults),
     fit_scatter_run};

@@ -1,4 +1,4 @@
-/* Scattered radiation in one view from kernels or as a constant: see scatter.h. */
+/* Scattered radiation in one view from kernels, of a body, or as a constant: see scatter.h. */
 #include "core/correct/scatter.h"
 
 #include <math.h>
@@ -6,7 +6,9 @@
 #include <stdlib.h>
 #include <string.h>
 
-enum { STEPS = 12 };                      /* after which t has settled to 1e-3 where two thirds of T are scatter */
+enum { STEPS = 12, BODY_STEPS = 4 }; /* after which t has settled to 1e-3 where two thirds of T are scatter */
+/* The logarithm of a body's S over that of t, where t changes everywhere; steps of the search go by it. */
+static const float FOLLOWS = 0.4f;
 static const float T_LEAST = 1e-6f;       /* a transmission below which p says nothing */
 static const double DARKEST_SHARE = 0.05; /* of the cells */
 
@@ -26,6 +28,7 @@ struct scatter {
 	/* [kernel][to][from]: shares of a cell's scatter that reach another cell. */
 	float *rows[SCATTER_KERNELS_MOST], *columns[SCATTER_KERNELS_MOST];
 	double width[SCATTER_KERNELS_MOST];                             /* that these were made for */
+	struct scatter_field *field;                                    /* of a body, in place of kernels */
 	float *total, *primary, *estimate, *source, *between, *blurred; /* [cells] each, of one allocation */
 	float *log_primary, *sorted;
 };
@@ -56,9 +59,9 @@ static void interpolation_make(struct axis *axis)
 	}
 }
 
-static int axis_open(struct axis *axis, int pixels, double pitch)
+static int axis_open(struct axis *axis, int pixels, double pitch, int most)
 {
-	const int each = (pixels + SCATTER_CELLS - 1) / SCATTER_CELLS;
+	const int each = (pixels + most - 1) / most;
 
 	axis->cells = (pixels + each - 1) / each;
 	axis->pixels = pixels;
@@ -128,17 +131,29 @@ static int scatter_allocate(struct scatter *scatter, struct error *err)
 	return 0;
 }
 
-int scatter_new(const struct scatter_model *model, int columns, int rows, const double pixel_mm[2],
+static int field_open(struct scatter *scatter, const struct scatter_beam *beam)
+{
+	const int pixels[2] = {scatter->across.pixels, scatter->along.pixels};
+	const int cells[2] = {scatter->across.cells, scatter->along.cells};
+
+	scatter->field = scatter_field_new(beam, pixels, cells);
+	return scatter->field == NULL ? ERR_NO_MEMORY : 0;
+}
+
+int scatter_new(const struct scatter_model *model, int columns, int rows, const struct scatter_beam *beam,
 		struct scatter **ret_scatter, struct error *err)
 {
+	const int most = model->body.amplitude > 0 ? SCATTER_BODY_CELLS : SCATTER_CELLS;
 	struct scatter *scatter = calloc(1, sizeof(*scatter));
 	int code = ERR_NO_MEMORY;
 
 	if (scatter != NULL) {
 		scatter->model = *model;
-		code = axis_open(&scatter->across, columns, pixel_mm[0]);
+		code = axis_open(&scatter->across, columns, beam->pixel_mm[0], most);
 		if (code == 0)
-			code = axis_open(&scatter->along, rows, pixel_mm[1]);
+			code = axis_open(&scatter->along, rows, beam->pixel_mm[1], most);
+		if (code == 0 && model->body.amplitude > 0)
+			code = field_open(scatter, beam);
 	}
 	code = code < 0 ? error_set(err, code, "no memory for the scatter of %d x %d pixels", columns, rows)
 			: scatter_allocate(scatter, err);
@@ -160,6 +175,7 @@ void scatter_free(struct scatter *scatter)
 		free(scatter->rows[k]);
 		free(scatter->columns[k]);
 	}
+	scatter_field_free(scatter->field);
 	axis_clear(&scatter->across);
 	axis_clear(&scatter->along);
 	free(scatter->total);
@@ -251,7 +267,7 @@ static void blur(struct scatter *scatter, int k)
 		     scatter->blurred);
 }
 
-/* S of a primary. */
+/* S of a primary, by kernels or of a body. */
 static void scatter_of_primary(struct scatter *scatter, const struct scatter_model *model, const float *primary,
 			       float *ret_scatter)
 {
@@ -262,6 +278,8 @@ static void scatter_of_primary(struct scatter *scatter, const struct scatter_mod
 		p[i] = primary[i] < 1 ? -logf(fmaxf(primary[i], T_LEAST)) : 0;
 		ret_scatter[i] = 0;
 	}
+	if (scatter->field != NULL)
+		scatter_field_of(scatter->field, &model->body, p, ret_scatter);
 	for (int k = 0; k < model->count; k++) {
 		const struct scatter_kernel *kernel = &model->kernels[k];
 		const float asymmetry = (float)kernel->asymmetry, power = (float)kernel->power;
@@ -306,6 +324,27 @@ static void estimate_constant(struct scatter *scatter)
 		scatter->estimate[i] = (float)(sum / (double)count * fraction / (1 + fraction));
 }
 
+/*
+ * A body's S is smooth and goes along with t where t changes everywhere. A step that is as if it always did finds t
+ * where most of the total is scatter; a step as for kernels would go on for long there.
+ */
+static void find_field(struct scatter *scatter, const struct scatter_model *model, const float *total,
+		       float *ret_scatter)
+{
+	const size_t cells = cells_of(scatter);
+	float *primary = scatter->primary;
+
+	for (int step = 0; step < BODY_STEPS; step++) {
+		scatter_of_primary(scatter, model, primary, ret_scatter);
+		for (size_t i = 0; i < cells; i++) {
+			const float sum = primary[i] + ret_scatter[i];
+			const float power = sum / (primary[i] + FOLLOWS * ret_scatter[i]);
+
+			primary[i] = fmaxf(T_LEAST, primary[i] * powf(fmaxf(total[i], T_LEAST) / sum, power));
+		}
+	}
+}
+
 void scatter_of_total(struct scatter *scatter, const struct scatter_model *model, const float *total,
 		      float *ret_scatter)
 {
@@ -314,6 +353,10 @@ void scatter_of_total(struct scatter *scatter, const struct scatter_model *model
 
 	for (size_t i = 0; i < cells; i++)
 		primary[i] = fmaxf(total[i], T_LEAST);
+	if (scatter->field != NULL) {
+		find_field(scatter, model, total, ret_scatter);
+		return;
+	}
 	for (int step = 0; step < STEPS; step++) {
 		scatter_of_primary(scatter, model, primary, ret_scatter);
 		for (size_t i = 0; i < cells; i++)
@@ -367,11 +410,4 @@ void scatter_row(const struct scatter *scatter, int row, float *ret_row)
 
 		ret_row[column] = cell[0] + across->share[column] * (cell[1] - cell[0]);
 	}
-}
-
-const char *scatter_model_wrong(const struct scatter_model *model)
-{
-	if (model->fraction > 0 ? model->count != 0 : model->count < 1)
-		return "either kernels or a fraction is expected";
-	return NULL;
 }

@@ -3,6 +3,7 @@
 
 #include <stdbool.h>
 
+#include "core/correct/scatter_body.h"
 #include "core/detector.h"
 #include "core/error.h"
 
@@ -20,6 +21,8 @@
  * columns. Outside of the detector there is no beam. The primary itself is what is sought: t <- T t / (t + S(t)) from
  * the total T, which is exact at once where S goes with t.
  *
+ * With a body in place of kernels S(t) is what scatter_body.h says, and the cells are fewer.
+ *
  * With a fraction in place of kernels S is the same all over the detector: that fraction of the primary in the darkest
  * twentieth of the cells.
  */
@@ -27,8 +30,8 @@ enum { SCATTER_CELLS = 64 }; /* along a row or a column, at most */
 
 struct scatter;
 
-/* The model is copied. pixel_mm: pitches along a row and along a column. */
-int scatter_new(const struct scatter_model *model, int columns, int rows, const double pixel_mm[2],
+/* The model is copied. Of the beam kernels want the pixels' pitches alone. */
+int scatter_new(const struct scatter_model *model, int columns, int rows, const struct scatter_beam *beam,
 		struct scatter **ret_scatter, struct error *err);
 void scatter_free(struct scatter *scatter); /* NULL is fine */
 
@@ -47,11 +50,8 @@ void scatter_cells(const struct scatter *scatter, int *ret_across, int *ret_alon
 /* Means of the pixels that are numbers. A cell without any has what the nearest one in its row has, or NaN if `gaps`.
  */
 void scatter_means(const struct scatter *scatter, const float *image, bool gaps, float *ret_cells);
-/* The model may be another one than that of scatter_new, with as many kernels. */
+/* The model may be another one than that of scatter_new, with as many kernels, or a body as that had. */
 void scatter_of_total(struct scatter *scatter, const struct scatter_model *model, const float *total,
 		      float *ret_scatter);
-
-/* What is wrong with the numbers of a model; NULL: nothing. */
-const char *scatter_model_wrong(const struct scatter_model *model);
 
 #endif

@@ -1,6 +1,6 @@
 /*
- * Scattered radiation as a row of corrections[]: taken off each view's counts, by kernels or as a constant (scatter.h),
- * or as images of it say (scatter_images.h).
+ * Scattered radiation as a row of corrections[]: taken off each view's counts, by kernels, of a body or as a constant
+ * (scatter.h), or as images of it say (scatter_images.h).
  */
 #include <math.h>
 #include <stdlib.h>
@@ -43,11 +43,43 @@ static bool is_wanted(const struct recipe *recipe, const struct linearise *linea
 	return linearise->scatter != NULL;
 }
 
+/* Source, isocentre and detector as they are in the first view. */
+static struct scatter_beam beam_of(const struct view *view, bool turned)
+{
+	const double *steps[2] = {view->column_step, view->row_step};
+	struct scatter_beam beam;
+	double normal[3], away[3], length;
+
+	vec_cross(view->column_step, view->row_step, normal);
+	for (int i = 0; i < 3; i++)
+		away[i] = view->pixel0[i] - view->source[i];
+	length = copysign(vec_norm(normal), vec_dot(away, normal));
+	beam.detector_mm = vec_dot(away, normal) / length;
+	beam.body_mm = -vec_dot(view->source, normal) / length;
+	for (int axis = 0; axis < 2; axis++) {
+		const double *step = steps[turned ? 1 - axis : axis];
+
+		beam.pixel_mm[axis] = vec_norm(step);
+		beam.centre[axis] = -vec_dot(away, step) / vec_dot(step, step);
+	}
+	return beam;
+}
+
 static int check(const struct linearise *linearise, const struct geometry *geometry, struct error *err)
 {
-	(void)geometry;
-	if (linearise->scatter != NULL && linearise->quantity != QUANTITY_INTENSITY)
+	if (linearise->scatter == NULL)
+		return 0;
+	if (linearise->quantity != QUANTITY_INTENSITY)
 		return error_set(err, ERR_INVALID, "scatter cannot be taken off line integrals, but off intensities");
+	if (linearise->scatter->body.amplitude > 0) {
+		const struct scatter_beam beam = beam_of(&geometry->views[0], false);
+
+		if (!(beam.body_mm > 0 && beam.body_mm < beam.detector_mm))
+			return error_set(err, ERR_INVALID,
+					 "a body that scatters is expected about the origin, between source and "
+					 "detector: it is %.4g mm from the source, the detector %.4g mm",
+					 beam.body_mm, beam.detector_mm);
+	}
 	return 0;
 }
 
@@ -85,14 +117,12 @@ static int open_images(const struct input *input, struct state *state, struct er
 static int open_estimate(const struct correction_job *job, struct state *state, struct error *err)
 {
 	const struct input *input = job->input;
-	const struct view *view = &job->geometry->views[0];
-	const double pitch[2] = {vec_norm(view->column_step), vec_norm(view->row_step)};
-	const double pixel[2] = {pitch[input->turned ? 1 : 0], pitch[input->turned ? 0 : 1]};
+	const struct scatter_beam beam = beam_of(&job->geometry->views[0], input->turned);
 
 	state->total = malloc(input->pixels * sizeof(*state->total));
 	if (state->total == NULL)
 		return error_set(err, ERR_NO_MEMORY, "no memory for the scatter of a view");
-	return scatter_new(input->given.scatter, input->columns, input->rows, pixel, &state->scatter, err);
+	return scatter_new(input->given.scatter, input->columns, input->rows, &beam, &state->scatter, err);
 }
 
 static int open_state(const struct correction_job *job, void **ret_state, struct error *err)

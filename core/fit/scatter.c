@@ -7,7 +7,7 @@
 
 #include "core/fit/least_squares.h"
 
-enum { KERNEL_PARAMETERS = 5, PLACES_LEAST = 30 };
+enum { KERNEL_PARAMETERS = 5, BODY_PARAMETERS = 2, PLACES_LEAST = 30 };
 static const double PRIMARY_LEAST = 1e-4; /* against air */
 
 /* A cell of an exposure whose scatter is known. */
@@ -24,10 +24,21 @@ struct fit {
 	struct place *places;
 };
 
+/* Both are positive: their logarithms are sought, from about what they are without a grid on. */
+static const double BODY_START[BODY_PARAMETERS] = {0, -1.2};
+
+static void body_of(const double *x, struct scatter_body *ret)
+{
+	ret->amplitude = fmin(fmax(exp(x[0]), SCATTER_BODY_LEAST), SCATTER_AMPLITUDE_MOST);
+	ret->multiple = fmin(exp(x[1]), SCATTER_MULTIPLE_MOST);
+}
+
 /* Amplitudes and widths are positive, powers and exponents within what physics may have. */
 static void model_of(const struct fit *fit, const double *x, struct scatter_model *ret)
 {
 	*ret = (struct scatter_model){.count = fit->kernels};
+	if (fit->kernels == 0)
+		body_of(x, &ret->body);
 	for (int k = 0; k < fit->kernels; k++) {
 		const double *of = x + KERNEL_PARAMETERS * k;
 
@@ -88,11 +99,13 @@ static int find_places(struct fit *fit, const struct scatter_exposure *exposures
 	return code;
 }
 
-static int fit_open(struct fit *fit, int columns, int rows, const double pixel_mm[2], struct error *err)
+static int fit_open(struct fit *fit, int columns, int rows, const struct scatter_beam *beam, struct error *err)
 {
 	const struct scatter_model model = {
-	    .count = fit->kernels, .kernels = {{.width_mm = 1}, {.width_mm = 1}, {.width_mm = 1}, {.width_mm = 1}}};
-	int across, along, code = scatter_new(&model, columns, rows, pixel_mm, &fit->scatter, err);
+	    .count = fit->kernels,
+	    .kernels = {{.width_mm = 1}, {.width_mm = 1}, {.width_mm = 1}, {.width_mm = 1}},
+	    .body.amplitude = fit->kernels == 0};
+	int across, along, code = scatter_new(&model, columns, rows, beam, &fit->scatter, err);
 
 	if (code < 0)
 		return code;
@@ -106,23 +119,26 @@ static int fit_open(struct fit *fit, int columns, int rows, const double pixel_m
 	return 0;
 }
 
-int scatter_fit(const struct scatter_exposure *exposures, int count, int columns, int rows, const double pixel_mm[2],
-		int kernels, struct scatter_fit *ret_fit, struct error *err)
+int scatter_fit(const struct scatter_exposure *exposures, int count, int columns, int rows,
+		const struct scatter_beam *beam, int kernels, struct scatter_fit *ret_fit, struct error *err)
 {
 	struct fit fit = {.exposures = count, .kernels = kernels};
 	struct scatter_fit result = {0};
 	double x[KERNEL_PARAMETERS * SCATTER_KERNELS_MOST];
-	int code = fit_open(&fit, columns, rows, pixel_mm, err);
+	int code = fit_open(&fit, columns, rows, beam, err);
 
 	if (code == 0)
 		code = find_places(&fit, exposures, err);
+	if (kernels == 0)
+		memcpy(x, BODY_START, sizeof(BODY_START));
 	for (int k = 0; k < kernels; k++) {
 		const double start[KERNEL_PARAMETERS] = {log(0.2 / kernels), 0, 1, log(80) - k * log(3), 0.02};
 
 		memcpy(x + KERNEL_PARAMETERS * k, start, sizeof(start));
 	}
 	if (code == 0) {
-		const struct least_squares problem = {.parameters = KERNEL_PARAMETERS * kernels,
+		const struct least_squares problem = {.parameters =
+							  kernels > 0 ? KERNEL_PARAMETERS * kernels : BODY_PARAMETERS,
 						      .residuals = fit.count,
 						      .context = &fit,
 						      .residuals_of = residuals_of,

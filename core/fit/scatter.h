@@ -4,12 +4,12 @@
 #include "core/correct/scatter.h"
 
 /*
- * Kernels for core/correct/scatter.h from exposures whose scatter is known at some places: behind beam stops in a
- * second exposure, or everywhere.
+ * Kernels or a body for core/correct/scatter.h from exposures whose scatter is known at some places: behind beam stops
+ * in a second exposure, or everywhere.
  *
  * The residual is the error of the line integral that the correction leaves: what the estimate from the whole
  * exposure lacks of the known scatter, against the primary. The kernels are of different widths, with amplitude,
- * exponent, power and asymmetry of their own.
+ * exponent, power and asymmetry of their own. Without kernels (0) it is a body, core/correct/scatter_body.h.
  */
 struct scatter_exposure {
 	const float *total;   /* [row][column], against air; NaN for pixels that say nothing */
@@ -24,7 +24,7 @@ struct scatter_fit {
 };
 
 /* ERR_IMPOSSIBLE where too few places are known, or the scatter is not below the total. */
-int scatter_fit(const struct scatter_exposure *exposures, int count, int columns, int rows, const double pixel_mm[2],
-		int kernels, struct scatter_fit *ret_fit, struct error *err);
+int scatter_fit(const struct scatter_exposure *exposures, int count, int columns, int rows,
+		const struct scatter_beam *beam, int kernels, struct scatter_fit *ret_fit, struct error *err);
 
 #endif

@@ -20,6 +20,7 @@ SCAN: Document = {
     "geometry": {"kind": "circular", "source_to_isocentre_mm": 500, "source_to_detector_mm": 900, "angle_step_deg": 30},
 }
 IMAGES: Document = {"kind": "images", "columns": 8, "rows": 8}
+BODY: Document = {"kind": "body", "amplitude": 1.3, "multiple": 0.3}
 CIRCLES: Document = {"kind": "circles", "balls": 12, "diameter_mm": 110, "distance_mm": 90, "ball_mm": 3.2}
 HELIX: Document = {"kind": "helix", "balls": 20, "diameter_mm": 110, "pitch_mm": 90, "angle_step_deg": 20, "ball_mm": 3.2}
 
@@ -33,6 +34,8 @@ TRIED = [
     ("/v1/scans", "ScanRequest", {**SCAN, "projections": {**SCAN["projections"], "scatter": IMAGES}},
      ["/projections/scatter/kind", "/projections/scatter/columns", "/projections/scatter/rows",
       "/projections/scatter/every"]),
+    ("/v1/scans", "ScanRequest", {**SCAN, "projections": {**SCAN["projections"], "scatter": BODY}},
+     ["/projections/scatter/amplitude", "/projections/scatter/multiple"]),
     ("/v1/jobs", "JobRequest", {"scan": "SCAN"}, ["/preset"]),
     ("/v1/calibrations", "CalibrationRequest", {"scan": "SCAN", "phantom": CIRCLES},
      ["/arm", "/phantom/kind", "/phantom/circles", "/phantom/balls", "/phantom/diameter_mm", "/phantom/distance_mm",
@@ -118,7 +121,7 @@ def values(pointer: str, member: Document) -> Iterator[Tuple[str, Any, bool]]:
     for bound, away in (("minimum", -1), ("maximum", 1)):
         if bound in member and "enum" not in member:
             yield f"the {bound}", member[bound], False
-            yield f"beyond the {bound}", member[bound] + away * (1 if whole else 1e-3 * abs(member[bound])), True
+            yield f"beyond the {bound}", member[bound] + away * (1 if whole else 1e-3 * abs(member[bound]) or 1e-3), True
 
 
 def check(schemas: Document, scan: str) -> Iterator[str]:
