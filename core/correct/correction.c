@@ -202,6 +202,20 @@ void corrections_mark(const struct correction_chain *chain, struct correction_ma
 			corrections[i]->mark(&chain->job, chain->state[i], marks);
 }
 
+void corrections_draw_dense(const struct correction_chain *chain, int view, bool *ret_image)
+{
+	const struct geometry *geometry = chain->job.geometry;
+	const struct metal *dense = chain->job.dense;
+
+	memset(ret_image, 0, (size_t)geometry->columns * (size_t)geometry->rows * sizeof(*ret_image));
+	for (size_t i = 0; i < dense->traces_count; i++) {
+		const struct metal_trace *trace = &dense->traces[i];
+
+		for (int c = trace->first; trace->view == view && c <= trace->last; c++)
+			ret_image[(ptrdiff_t)trace->row * geometry->columns + c] = true;
+	}
+}
+
 int corrections_hide(struct correction_chain *chain, struct error *err)
 {
 	int code = 0;

@@ -185,6 +185,8 @@ int corrections_apply(struct correction_chain *chain, enum correction_time time,
 int corrections_warn(struct correction_chain *chain, struct error *err);
 int corrections_show(struct correction_chain *chain, double *ret_estimate_mm, struct error *err);
 void corrections_mark(const struct correction_chain *chain, struct correction_marks *marks);
+/* Draws which rays of a view are in the traces of what is very dense, [row][column]. */
+void corrections_draw_dense(const struct correction_chain *chain, int view, bool *ret_image);
 int corrections_hide(struct correction_chain *chain, struct error *err);
 const void *corrections_found(const struct correction_chain *chain, size_t *ret_bytes);
 /* ERR_INVALID where the job has no correction that finds anything. */

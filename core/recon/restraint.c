@@ -547,7 +547,8 @@ static void hold_back(const struct restraint *restraint, struct places *places, 
 struct showing {
 	const struct backend *backend;
 	struct volume *volume;
-	const struct node *nodes; /* NULL: its means stay */
+	const struct node *nodes;             /* NULL: its means stay */
+	const struct correction_chain *dense; /* whose rays are left out, or NULL */
 	float *slice;
 	size_t counts[2]; /* voxels of the object, and those that got back much */
 };
@@ -598,6 +599,8 @@ static int find_places(const struct restraint *restraint, struct showing *showin
 		wanted = true;
 		code = step > 1 ? ask_places(restraint, showing, places, 1, &rougher, err) : 0;
 	}
+	if (code == 0 && wanted && showing->dense != NULL)
+		code = places_see(places, showing->dense, err);
 	if (code < 0 || !wanted) {
 		places_free(places);
 		return code;
@@ -609,14 +612,14 @@ static int find_places(const struct restraint *restraint, struct showing *showin
 	return 0;
 }
 
-int restraint_show(struct restraint *restraint, const struct backend *backend, struct volume *volume, bool holds_dense,
-		   struct restraint_report *ret_report, struct error *err)
+int restraint_show(struct restraint *restraint, const struct backend *backend, struct volume *volume,
+		   const struct correction_chain *dense, struct restraint_report *ret_report, struct error *err)
 {
 	const int step = restraint->lost ? 1 : (restraint->cells[2] - 1) / LAYERS_MOST + 1;
 	struct restraint_report report = {.share = 1};
 	struct scratch scratch;
 	struct pair pair = {backend, volume, NULL, NULL};
-	struct showing showing = {.backend = backend, .volume = volume};
+	struct showing showing = {.backend = backend, .volume = volume, .dense = dense};
 	struct places *places = NULL;
 	int code = restraint->begun ? scratch_new(restraint, &scratch, err) : 0;
 
@@ -628,8 +631,8 @@ int restraint_show(struct restraint *restraint, const struct backend *backend, s
 	if (code == 0)
 		find_share(restraint, scratch.cells, scratch.scores, &report);
 	report.share = places_kept(report.share);
-	report.changed = report.share < 1 || restraint->lost || holds_dense;
-	restraint->holds_dense = holds_dense;
+	restraint->holds_dense = dense != NULL;
+	report.changed = report.share < 1 || restraint->lost || restraint->holds_dense;
 	if (code == 0 && restraint->lost) {
 		make_nodes(restraint, scratch.cells, scratch.nodes);
 		showing.nodes = scratch.nodes;

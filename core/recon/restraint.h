@@ -2,6 +2,7 @@
 #define CBCT_CORE_RECON_RESTRAINT_H
 
 #include "core/backend.h"
+#include "core/correct/correction.h"
 
 /*
  * How far the default's iterations are followed, where they may come out worse than FDK: beside what is very dense, and
@@ -76,8 +77,8 @@ size_t restraint_state_bytes(const struct restraint *restraint);
 const void *restraint_state(const struct restraint *restraint);
 int restraint_resume(struct restraint *restraint, const char *bytes, struct error *err);
 
-/* V becomes V', where it has begun. holds_dense: the rays through what is very dense were left out. */
-int restraint_show(struct restraint *restraint, const struct backend *backend, struct volume *volume, bool holds_dense,
-		   struct restraint_report *ret_report, struct error *err);
+/* V becomes V', where it has begun. dense: what has the traces of the rays that were left out; or NULL. */
+int restraint_show(struct restraint *restraint, const struct backend *backend, struct volume *volume,
+		   const struct correction_chain *dense, struct restraint_report *ret_report, struct error *err);
 
 #endif

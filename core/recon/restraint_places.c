@@ -20,14 +20,21 @@ static const float EDGE = 4;
 /* How far sums are smoothed, in passes of (1 2 1) / 4, and what cubes farther away count for beside the near ones. */
 enum { NEAR = 1, FAR = 8 };
 static const float FARTHER = 0.1f;
+/* k from which on a place's w is less. */
+static const float LONELY = 0.9f;
 /* m^2 is over so many voxels to either side. */
 enum { BESIDE = 2 };
 
-/* Sums of u, u h(S) h(V - S), u h(V - S)^2, u (V - S)^2 over a cube; then w and s^2 of it. */
+/* Sums of u, u h(S) h(V - S), u h(V - S)^2, u (V - S)^2 over a cube; then w, s^2 and (1 - k) / .1 of it. */
 enum { EVENNESS, CROSS, CHANGE2, SQUARE, SUMS };
-enum { SHARE = 0, SPREAD = 1 };
+enum { SHARE, SPREAD, LEFT, VALUES };
 struct place {
 	float of[SUMS];
+};
+
+/* Through the middle of a cube: those that meet the detector, and of these those that are left out. */
+struct rays {
+	int all, left;
 };
 
 struct places {
@@ -52,7 +59,8 @@ static size_t pixels_of(const struct grid *grid)
 
 size_t places_bytes(const struct grid *grid)
 {
-	return cells_of(grid) * (2 * sizeof(struct place) + sizeof(float)) + 2 * pixels_of(grid) * sizeof(float);
+	return cells_of(grid) * (2 * sizeof(struct place) + sizeof(float) + sizeof(struct rays)) +
+	       2 * pixels_of(grid) * sizeof(float);
 }
 
 int places_new(const struct grid *grid, double mu_water, double blur, struct places **ret_places, struct error *err)
@@ -214,11 +222,66 @@ double places_finish(struct places *places)
 		/* The nearest even voxels may be too far away to say anything. */
 		w = of[EVENNESS] > little ? (c2 * of[EVENNESS] - of[CROSS]) / (c2 * of[EVENNESS] + of[CHANGE2]) : 1;
 		places->near[i].of[SHARE] = (float)places_kept((double)w);
+		places->near[i].of[LEFT] = 1;
 		all += (double)places->even[i];
 		rougher += w < HALF ? (double)places->even[i] : 0;
 		places->near[i].of[SPREAD] = of[EVENNESS] > little ? of[SQUARE] / of[EVENNESS] : 0;
 	}
 	return all > 0 ? rougher / all : 0;
+}
+
+/* ---- rays that are left out ---- */
+
+static void count_rays(const struct places *places, const struct geometry *geometry, int view, const bool *traces,
+		       struct rays *rays)
+{
+	const struct grid *grid = places->grid;
+	const int *count = places->cells;
+	double matrix[12];
+
+	view_matrix(&geometry->views[view], matrix);
+#pragma omp parallel for schedule(static)
+	for (int z = 0; z < count[2]; z++)
+		for (int y = 0; y < count[1]; y++)
+			for (int x = 0; x < count[0]; x++) {
+				struct rays *of = rays + ((ptrdiff_t)z * count[1] + y) * count[0] + x;
+				const int at[3] = {x, y, z};
+				double point[3], column, row;
+
+				for (int axis = 0; axis < 3; axis++)
+					point[axis] =
+					    grid->origin[axis] + ((at[axis] + 0.5) * CELL - 0.5) * grid->spacing[axis];
+				if (!(view_project(matrix, point, &column, &row) > 0) || column < -0.5 || row < -0.5 ||
+				    column >= geometry->columns - 0.5 || row >= geometry->rows - 0.5)
+					continue;
+				of->all++;
+				of->left +=
+				    traces[(ptrdiff_t)(row + 0.5) * geometry->columns + (ptrdiff_t)(column + 0.5)];
+			}
+}
+
+int places_see(struct places *places, const struct correction_chain *dense, struct error *err)
+{
+	const struct geometry *geometry = dense->job.geometry;
+	const int views = geometry->count < PLACE_VIEWS ? geometry->count : PLACE_VIEWS;
+	const size_t cubes = cells_of(places->grid);
+	bool *traces = malloc((size_t)geometry->columns * (size_t)geometry->rows);
+	struct rays *rays = calloc(cubes, sizeof(*rays));
+	const bool enough = traces != NULL && rays != NULL;
+
+	for (int i = 0; i < views && enough; i++) {
+		const int view = (int)((long)i * geometry->count / views);
+
+		corrections_draw_dense(dense, view, traces);
+		count_rays(places, geometry, view, traces, rays);
+	}
+	for (size_t i = 0; i < cubes && enough; i++)
+		if (rays[i].all > 0)
+			places->near[i].of[LEFT] =
+			    fminf(1, (1 - (float)rays[i].left / (float)rays[i].all) / (1 - LONELY));
+	free(traces);
+	free(rays);
+	return enough ? 0 : error_set(err, ERR_NO_MEMORY, "no memory for the rays of %zu places", cubes);
 }
 
 /* ---- a slice ---- */
@@ -233,9 +296,9 @@ static int between(int voxel, int cells, float *ret_share)
 	return first;
 }
 
-/* w and s^2 of a line of cubes along x, at the height of a line of voxels. */
+/* The values of a line of cubes along x, at the height of a line of voxels. */
 struct line {
-	float of[GRID_SIZE_MAX / CELL][2];
+	float of[GRID_SIZE_MAX / CELL][VALUES];
 };
 
 static void line_at(const struct places *places, int y, int z, struct line *ret)
@@ -250,10 +313,9 @@ static void line_at(const struct places *places, int y, int z, struct line *ret)
 		const float weight = (corner & 1 ? share[0] : 1 - share[0]) * (corner >> 1 ? share[1] : 1 - share[1]);
 		const struct place *line = places->near + ((ptrdiff_t)k * count[1] + j) * count[0];
 
-		for (int i = 0; i < count[0] && weight > 0; i++) {
-			ret->of[i][SHARE] += weight * line[i].of[SHARE];
-			ret->of[i][SPREAD] += weight * line[i].of[SPREAD];
-		}
+		for (int i = 0; i < count[0] && weight > 0; i++)
+			for (int what = 0; what < VALUES; what++)
+				ret->of[i][what] += weight * line[i].of[what];
 	}
 }
 
@@ -318,6 +380,7 @@ void places_restrain(struct places *places, int z, double most, const float *sta
 
 			if (edge > 0 && (float)most > w && squares[at] > spread)
 				w += edge * (1 - spread / squares[at]) * ((float)most - w);
+			w *= along_line(&line, first, share, LEFT);
 			values[at] = start[at] + w * (values[at] - start[at]);
 		}
 	}

@@ -1,7 +1,7 @@
 #ifndef CBCT_CORE_RECON_RESTRAINT_PLACES_H
 #define CBCT_CORE_RECON_RESTRAINT_PLACES_H
 
-#include "core/scan/grid.h"
+#include "core/correct/correction.h"
 
 /*
  * The restraint of each place, w(x) in place of one w: see restraint.h.
@@ -17,6 +17,10 @@
  *
  *   w(x) = w + (1 - u) max(0, 1 - 4 s^2 / m^2) max(0, W - w),  m^2 = <(V - S)^2> over 5 x 5 voxels, W that of the
  * object
+ *
+ * Where the rays through what is very dense are left out, few of those through a place beside it may be left, and w(x)
+ * is less: times (1 - k) / .1 from k = .9 on, k the share of up to PLACE_VIEWS views whose ray through the place is. Up
+ * to k = .2 iterations leave .65 of FDK's error, .8 at .5, .93 at .8, and 1.22 from .9 on.
  */
 struct places;
 
@@ -24,7 +28,7 @@ struct places;
 double places_kept(double w);
 
 /* Voxels a side of a cube; the same as the restraint's. */
-enum { PLACE_CELL = 4 };
+enum { PLACE_CELL = 4, PLACE_VIEWS = 60 };
 
 size_t places_bytes(const struct grid *grid);
 /* blur: the width of FDK's, mm. */
@@ -39,6 +43,9 @@ void places_add(struct places *places, int z, const float *start, const float *v
  * is below a half there.
  */
 double places_finish(struct places *places);
+
+/* After places_finish: those rays are in the traces of what is dense. */
+int places_see(struct places *places, const struct correction_chain *dense, struct error *err);
 
 /* V of a slice becomes S + w(x) (V - S), before any bounds; most: W. */
 void places_restrain(struct places *places, int z, double most, const float *start, float *values);

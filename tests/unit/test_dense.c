@@ -4,7 +4,9 @@
 #include <stdlib.h>
 #include <string.h>
 
+#include "core/correct/metal.h"
 #include "core/recon/recon.h"
+#include "core/recon/restraint_places.h"
 #include "tests/unit/data.h"
 #include "tests/unit/scene.h"
 
@@ -303,6 +305,46 @@ START_TEST(bone_beside_a_lot_of_metal_is_what_fdk_has_of_it)
 }
 END_TEST
 
+/* Half of the detector's columns are left out in all views, or all of them, or none. */
+START_TEST(a_place_without_rays_has_nothing_of_the_iterations)
+{
+	enum { COLUMNS = 64, ROWS = 16, VIEWS = 60, SIDE = 32 };
+	const struct grid grid = grid_of(SIDE, SIDE, 8, 3, 3, 3);
+	const struct phantom none = {0, NULL};
+	const int last[3] = {-1, COLUMNS / 2 - 1, COLUMNS - 1};
+	struct metal dense = {.traces = calloc(VIEWS * ROWS, sizeof(struct metal_trace))};
+	float start[SIDE * SIDE], values[SIDE * SIDE];
+	struct correction_chain chain = {.job = {.dense = &dense}};
+	struct places *places;
+	struct error err;
+	struct scene scene;
+
+	ck_assert_ptr_nonnull(dense.traces);
+	scan_of(&scene, &none);
+	chain.job.geometry = &scene.geometry;
+	for (int i = 0; i < VIEWS * ROWS && last[_i] >= 0; i++)
+		dense.traces[dense.traces_count++] = (struct metal_trace){i / ROWS, i % ROWS, 0, last[_i]};
+	ck_assert_int_eq(places_new(&grid, MU_WATER, 3, &places, &err), 0);
+	places_begin(places);
+	for (int i = 0; i < SIDE * SIDE; i++) {
+		start[i] = (float)MU_WATER;
+		values[i] = 1.01f * (float)MU_WATER;
+	}
+	for (int z = 0; z < 8; z++)
+		places_add(places, z, start, values);
+	places_finish(places);
+	ck_assert_int_eq(places_see(places, &chain, &err), 0);
+	places_restrain(places, 4, 1, start, values);
+	/* A place is seen by half of the views at least while half of the columns are left. */
+	for (int i = 0; i < SIDE * SIDE; i++)
+		ck_assert_msg(fabsf(values[i] / (float)MU_WATER - (_i < 2 ? 1.01f : 1)) < 1e-5f, "%d: %g", i,
+			      (double)values[i]);
+	places_free(places);
+	scene_clear(&scene);
+	free(dense.traces);
+}
+END_TEST
+
 START_TEST(rays_are_left_out_to_the_same_bits_with_other_threads_and_after_a_yield)
 {
 	const struct grid grid = grid_of(64, 64, 8, 3.336, 3.336, 3.336);
@@ -329,6 +371,7 @@ Suite *dense_suite(void)
 	tcase_add_loop_test(tests, iterations_beside_rods_are_no_worse_than_fdk, 0, COUNT(tries));
 	tcase_add_loop_test(tests, iterations_beside_plates_leave_even_tissue_as_fdk_has_it, 0, COUNT(plates));
 	tcase_add_test(tests, bone_beside_a_lot_of_metal_is_what_fdk_has_of_it);
+	tcase_add_loop_test(tests, a_place_without_rays_has_nothing_of_the_iterations, 0, 3);
 	tcase_add_test(tests, rays_are_left_out_to_the_same_bits_with_other_threads_and_after_a_yield);
 	suite_add_tcase(suite, tests);
 	return suite;
