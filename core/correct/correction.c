@@ -5,6 +5,7 @@
 #include <string.h>
 
 #include "core/correct/counts.h"
+#include "core/correct/exterior_volume.h"
 #include "core/correct/input.h"
 #include "core/correct/metal.h"
 
@@ -96,8 +97,11 @@ int corrections_open(struct correction_chain *ret_chain, const struct correction
 
 	*ret_chain = (struct correction_chain){.job = *job, .input = input};
 	ret_chain->job.dense = calloc(1, sizeof(*ret_chain->job.dense));
-	if (ret_chain->job.dense == NULL)
-		return error_set(err, ERR_NO_MEMORY, "no memory for a list of dense voxels");
+	ret_chain->job.exterior = calloc(1, sizeof(*ret_chain->job.exterior));
+	if (ret_chain->job.dense == NULL || ret_chain->job.exterior == NULL) {
+		corrections_close(ret_chain);
+		return error_set(err, ERR_NO_MEMORY, "no memory for what corrections share");
+	}
 	if (counts_wanted(&input->given)) {
 		ret_chain->counts = malloc(input->pixels * sizeof(float));
 		if (ret_chain->counts == NULL)
@@ -121,6 +125,10 @@ void corrections_close(struct correction_chain *chain)
 	chain->counts = NULL;
 	free(chain->job.dense);
 	chain->job.dense = NULL;
+	if (chain->job.exterior != NULL)
+		exterior_volume_clear(chain->job.exterior);
+	free(chain->job.exterior);
+	chain->job.exterior = NULL;
 }
 
 /* Corrects the counts of a view, chain->counts. */

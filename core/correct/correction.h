@@ -62,6 +62,11 @@ struct correction_job {
 	bool *left_out_dense;              /* set where rays through what is very dense were left out of them */
 	double *settled;                   /* iterations after which relaxation falls (averaging.h); INFINITY: never */
 	struct metal *dense;               /* what is very dense, and its traces (dense.h); the chain's own */
+	/*
+	 * The model by which matter outside of the grid was taken out of the projections, on the host alone, until they
+	 * are averaged; where it does not go on nothing was taken. The chain's own.
+	 */
+	struct exterior_volume *exterior;
 	const struct warning_sink *warnings;
 	const struct cancel *cancel;
 };

@@ -39,10 +39,11 @@ static int bytes_of(const struct correction_ask *ask, struct correction_bytes *b
 	return 0;
 }
 
-/* The steps of exterior.h, which change the projections; *ret_rows are those concerned. */
+/* The steps of exterior.h, which change the projections; *ret_rows are those concerned, *ret_taken: so is what lies
+ * outside of the grid. */
 static int subtract(const struct correction_job *job, const struct exterior_volume_options *options,
 		    const struct exterior_rows *seen, struct exterior_volume *exterior, struct exterior_rows *ret_rows,
-		    struct error *err)
+		    bool *ret_taken, struct error *err)
 {
 	const struct recipe *recipe = job->recipe;
 	struct exterior_rows rows = {0};
@@ -63,6 +64,7 @@ static int subtract(const struct correction_job *job, const struct exterior_volu
 		return code;
 	}
 	code = exterior_subtract(exterior, options, steps, seen, job->work, &rows, err);
+	*ret_taken = exterior->goes_on;
 	/* Iterations without FDK start from zero. */
 	if (code == 0 && exterior->goes_on && recipe->fdk.on && *job->iteration == 0)
 		code = exterior_start(exterior, options, job->work, job->volume, err);
@@ -189,8 +191,9 @@ static int apply(const struct correction_job *job, void *state, enum correction_
 	    .dense = job->dense,
 	    .cancel = job->cancel,
 	};
-	struct exterior_volume exterior = {0};
+	struct exterior_volume *exterior = job->exterior;
 	struct exterior_rows seen, rows = {0};
+	bool taken = false;
 	int code = look(job, &options, &seen, err);
 
 	(void)state;
@@ -204,17 +207,17 @@ static int apply(const struct correction_job *job, void *state, enum correction_
 			     "out of the projections: SART piles it up in the grid");
 	if (!sound && !fdk && seen.outside == 0 && !seen.possible)
 		return 0;
-	code = make(job, &options, &exterior, &seen, err);
+	code = make(job, &options, exterior, &seen, err);
 	if (code < 0 || shows_nothing(&seen)) {
-		exterior_volume_clear(&exterior);
+		exterior_volume_clear(exterior);
 		return code;
 	}
 	if (options.truncated && *job->iteration == 0)
 		code = job->wide(job->wide_context, err);
 	if (code == 0)
-		code = subtract(job, &options, &seen, &exterior, &rows, err);
+		code = subtract(job, &options, &seen, exterior, &rows, &taken, err);
 	if (code == 0 && !fdk && sound && job->recipe->fdk.extend &&
-	    truncated_warn(job, exterior.truncated, job->geometry->columns))
+	    truncated_warn(job, exterior->truncated, job->geometry->columns))
 		warn_of_zero(job);
 	if (code == 0 && options.truncated)
 		*job->settled = fmin(*job->settled, EXTERIOR_SETTLED);
@@ -222,7 +225,10 @@ static int apply(const struct correction_job *job, void *state, enum correction_
 		*job->outside = true;
 	if (code == 0)
 		warn_of_outside(job, rows.outside);
-	exterior_volume_clear(&exterior);
+	if (code == 0 && taken)
+		exterior_volume_leave_device(exterior);
+	else
+		exterior_volume_clear(exterior);
 	return code;
 }
 

@@ -677,14 +677,22 @@ bool exterior_volume_has_outside(const struct exterior_volume *s, const struct g
 	return squares > 0 && count >= least;
 }
 
+void exterior_volume_leave_device(struct exterior_volume *s)
+{
+	s->backend->volume_free(s->volume);
+	s->backend->plan_free(s->plan);
+	fdk_weights_clear(&s->weights);
+	free(s->seen);
+	s->volume = NULL;
+	s->plan = NULL;
+	s->seen = NULL;
+}
+
 void exterior_volume_clear(struct exterior_volume *s)
 {
 	if (s->backend == NULL)
 		return;
-	s->backend->volume_free(s->volume);
-	s->backend->plan_free(s->plan);
-	fdk_weights_clear(&s->weights);
+	exterior_volume_leave_device(s);
 	free(s->voxels);
-	free(s->seen);
 	*s = (struct exterior_volume){0};
 }

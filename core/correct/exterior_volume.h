@@ -94,6 +94,8 @@ int exterior_volume_fit(struct exterior_volume *exterior, const struct exterior_
  */
 bool exterior_volume_has_outside(const struct exterior_volume *exterior, const struct grid *grid);
 void exterior_volume_clear(struct exterior_volume *exterior);
+/* Frees all but what exterior_volume_sample needs, on the host; exterior_volume_clear frees that. */
+void exterior_volume_leave_device(struct exterior_volume *exterior);
 
 /*
  * A part of exterior_volume_make, where rows are truncated. Beside the field of view the voxels on the host become the

@@ -221,6 +221,45 @@ START_TEST(the_end_slices_of_a_trunk_longer_than_the_panel_are_true)
 }
 END_TEST
 
+/*
+ * The default averages pixels that are finer than voxels. Where it averaged what was left of the projections once the
+ * exterior was out of them, over the grid's own faces, it took 60 to 100 HU of the end slices and told nothing.
+ */
+static const struct {
+	enum orbit_kind kind;
+	const struct phantom *phantom;
+	double end, pixels; /* mm; in a voxel */
+} averaged[] = {{CIRCLE, &trunk, 55, 1.5}, {CIRCLE, &pelvis, 60, 2}, {SHORT_SCAN, &tapered, 50, 3}};
+
+START_TEST(the_end_slices_are_true_where_pixels_are_averaged)
+{
+	const double spacing = averaged[_i].pixels * PIXEL / 1100 * 620;
+	const double end = spacing * round(averaged[_i].end / spacing);
+	struct grid grid = grid_between(end, end, spacing);
+	struct recipe recipe = sart_on(&grid);
+	float *truth = malloc(sizeof(float) * grid_voxels(&grid));
+	struct outcome outcome = {0};
+	struct scene scene = {0};
+	struct worst worst;
+
+	ck_assert_ptr_nonnull(truth);
+	ck_assert(scan_of(&scene, averaged[_i].kind, averaged[_i].phantom));
+	phantom_voxelise(averaged[_i].phantom, &grid, 3, truth);
+	recipe.iterate.iterations = 4;
+	recipe.tv.on = true;
+	recipe_automatic_tv(&recipe, TV_PROXIMAL);
+	run(&scene, &recipe, &outcome);
+	worst = slice_errors(&scene.geometry, &grid, outcome.last, truth);
+	ck_assert_ptr_nonnull(strstr(outcome.warnings, "averaged_pixels: "));
+	ck_assert_ptr_nonnull(strstr(outcome.warnings, "outside_grid: "));
+	ck_assert_msg(worst.any < 20, "%g pixels a voxel: a slice's mean is off by %.1f HU", averaged[_i].pixels,
+		      worst.any);
+	outcome_clear(&outcome);
+	scene_clear(&scene);
+	free(truth);
+}
+END_TEST
+
 /* Arcs that FDK can make little of: what SART makes of them must not get worse by what lies beyond the ends. */
 START_TEST(a_poor_orbit_does_not_pile_the_trunk_up)
 {
@@ -849,6 +888,7 @@ Suite *exterior_suite(void)
 	tcase_set_timeout(bits, 0);
 	tcase_set_timeout(truncated, 0);
 	tcase_add_loop_test(tests, the_end_slices_of_a_trunk_longer_than_the_panel_are_true, 0, COUNT(ends));
+	tcase_add_loop_test(tests, the_end_slices_are_true_where_pixels_are_averaged, 0, COUNT(averaged));
 	tcase_add_loop_test(tests, a_poor_orbit_does_not_pile_the_trunk_up, 0, 2);
 	tcase_add_loop_test(tests, a_real_abdomen_keeps_its_end_slices, 0, 2);
 	tcase_add_loop_test(tests, what_lies_outside_of_the_grid_is_looked_at_whatever_is_done_about_truncated_rows, 0,
