@@ -111,8 +111,8 @@ const struct warning_kind warning_kinds[] = {
     {"defects_wide", SEVERITY_SERIOUS,
      "Bad pixels of the detector are too many, or too close together, to be filled in: the image may be wrong there."},
     {"detector_shadow", SEVERITY_SERIOUS,
-     "The edge of the detector lay in shadow in all projections, as behind a collimator, and the flat image does not "
-     "show that: it was left out, and the image shows less than the scan should."},
+     "The edge of the detector lay in shadow in all projections, as behind a collimator, and nothing in the scan "
+     "takes that off: it was left out, and the image shows less than the scan should."},
     {"stuck_pixels", SEVERITY_CAUTION,
      "Some pixels of the detector do not follow the others and were replaced from their neighbours."},
     {"rings", SEVERITY_INFO, "Some pixels of the detector had changed since it was calibrated, and were corrected."},

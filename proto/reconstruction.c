@@ -764,19 +764,29 @@ static void describe_shadow(int before, int behind, int all, const char *name, c
 		ret[0] = 0;
 }
 
+/* What the samples are divided by, if anything is known of it, does not have the shadow. */
+static const char *unshadowed(const struct linearise *linearise)
+{
+	if (linearise->quantity == QUANTITY_LINE_INTEGRAL)
+		return ", as where line integrals were made with a flat image that lacks the shadow";
+	if (linearise->image[IMAGE_FLAT] == NULL)
+		return ", and there is no flat image to divide by";
+	return ", and not in the flat image";
+}
+
 static void tell_shadow(struct reconstruction *reconstruction, const struct shadow_found *found)
 {
 	const struct geometry *whole = &reconstruction->files.scan->geometry;
-	char columns[80], rows[80], detail[360];
+	char columns[80], rows[80], detail[420];
 
 	describe_shadow(found->before[0], found->behind[0], whole->columns, "columns", columns, sizeof(columns));
 	describe_shadow(found->before[1], found->behind[1], whole->rows, "rows", rows, sizeof(rows));
 	snprintf(
 	    detail, sizeof(detail),
 	    "%s%s%s are darker than those beside them, by line integrals of %.2g to %.2g, in all of %d projections "
-	    "looked at, and not in the flat image: they were left out",
+	    "looked at%s: they were left out",
 	    columns, columns[0] != 0 && rows[0] != 0 ? " and " : "", rows, (double)found->least, (double)found->most,
-	    found->views);
+	    found->views, unshadowed(&reconstruction->linearise));
 	run_warning(&reconstruction->run, "detector_shadow", detail);
 }
 

@@ -19,6 +19,7 @@ struct profiles {
 	int pixels, lines;  /* along the profile, and across it */
 	size_t step, line;  /* samples from a pixel to the next, and from a line to the next */
 	int bins, segments; /* bins of a profile */
+	double axis;        /* bin of the image of the rotation's axis; NAN where that is not along the lines */
 	float *values;      /* [view][bin][segment], line integrals; NAN where nothing is good */
 };
 
@@ -27,6 +28,25 @@ struct shadow {
 	struct profiles profiles[2]; /* across columns, across rows */
 	int most, views;
 };
+
+/* Where along columns (0) or rows (1) the image of z lies at the isocentre, pixels; NAN where it runs along them. */
+static double axis_pixel(const struct geometry *geometry, int direction)
+{
+	static const double isocentre[3] = {0}, above[3] = {0, 0, 1};
+	double sum = 0;
+
+	for (int k = 0; k < geometry->count; k++) {
+		double matrix[12], at[2], beside[2];
+
+		view_matrix(&geometry->views[k], matrix);
+		if (!(view_project(matrix, isocentre, &at[0], &at[1]) > 0) ||
+		    !(view_project(matrix, above, &beside[0], &beside[1]) > 0) ||
+		    fabs(beside[direction] - at[direction]) >= fabs(beside[1 - direction] - at[1 - direction]))
+			return NAN;
+		sum += at[direction];
+	}
+	return sum / geometry->count;
+}
 
 static struct profiles profiles_of(int pixels, int lines, size_t step, size_t line)
 {
@@ -57,6 +77,7 @@ int shadow_new(const struct linearise *linearise, const struct geometry *geometr
 	for (int axis = 0; axis < 2; axis++) {
 		struct profiles *profiles = &shadow->profiles[axis];
 
+		profiles->axis = (axis_pixel(geometry, axis) + 0.5) * profiles->bins / profiles->pixels - 0.5;
 		profiles->values = calloc((size_t)views * (size_t)profiles->bins * (size_t)profiles->segments,
 					  sizeof(*profiles->values));
 		if (profiles->values == NULL) {
@@ -316,6 +337,33 @@ static bool is_an_edge(const struct edge *edge, int dark, int length, const stru
 	return length == 1;
 }
 
+/*
+ * True if the same step is found where the object would have it once more, as far on the other side of the axis, and
+ * not as the border of a shadow that comes from the other edge. The rays there are those of the opposite views: what
+ * the object has at one place of all profiles it has at both, a collimator at one.
+ */
+static bool has_twin(const struct edge *edge, int dark, int length, const struct border *border)
+{
+	const int bins = edge->profiles->bins;
+	const double axis = edge->behind ? bins - 1 - edge->profiles->axis : edge->profiles->axis;
+	const double further = bins - 1 - 2 * axis; /* from the other edge than the border from its own */
+	struct edge other = *edge;
+
+	other.behind = !edge->behind;
+	if (!(fabs(further) < bins))
+		return false;
+	for (int more = 0; more < 2; more++) {
+		const int twin = dark + (int)floor(further) + more;
+		struct border found;
+
+		if (twin >= 0 && twin + length < bins &&
+		    border_has(&other, twin, twin + length, border->step, &found) &&
+		    !reaches_edge(&other, twin, &found))
+			return true;
+	}
+	return false;
+}
+
 /* The bins of the shadow's border that are partly in shadow are taken for shadow. */
 static int penumbra_end(const struct edge *edge, int bins, const struct border *border)
 {
@@ -338,7 +386,7 @@ static struct border find_border(const struct edge *edge)
 
 			if (!border_at(edge, dark, dark + length, &border) || border.step <= best.step ||
 			    !reaches_edge(edge, dark, &border) || !stands_alone(edge, dark, length, &border) ||
-			    !is_an_edge(edge, dark, length, &border))
+			    !is_an_edge(edge, dark, length, &border) || has_twin(edge, dark, length, &border))
 				continue;
 			border.bins = penumbra_end(edge, dark + length, &border);
 			if (border.bins <= most)

@@ -17,8 +17,9 @@
  * of it and 0.05, in all segments and views, or by less where the object begins at the border and the shadow has air
  * behind it. An object has no such edge: its own step changes along it and from view to view, or goes on on one side,
  * as the slope of a plate does that is seen from above or of a tube's wall that leaves the detector, or falls by equal
- * line integrals and not by equal parts of the light. 15 % of the views may differ in a segment, for metal and noise,
- * and segments at the ends that lie in a shadow of the other direction.
+ * line integrals and not by equal parts of the light. What looks the same from all sides has the step twice, as far on
+ * either side of the axis; a detector that is displaced sees both. 15 % of the views may differ in a
+ * segment, for metal and noise, and segments at the ends that lie in a shadow of the other direction.
  *
  * None is found where nothing is seen beside the shadows: they might be all of a wide, flat object.
  */

@@ -90,20 +90,22 @@ test_stuck_pixels_stay_replaced_in_a_run_that_goes_on() {
 	[ "$(digest)" = "$undisturbed" ] || fail "the bits of the job that was not disturbed"
 }
 
-shadow_told() {
+shadow_told() { # words of the detail
 	req GET "/v1/jobs/$job"
 	expect_json '[.warnings[] | select(.code == "detector_shadow")] | length == 1 and .[0].severity == "serious" and
-		(.[0].detail | startswith("the first 4 and the last 6 of 80 columns are darker"))'
+		(.[0].detail | startswith("the first 4 and the last 6 of 80 columns are darker")) and
+		(.[0].detail | contains("'"$1"'"))'
 }
 # 1,336 HU where the shadow is believed, and told as truncated alone. The ball ends within what is left.
 test_edges_behind_a_collimator_are_told_and_left_out() {
 	local rings="{\"scan\": \"SCAN\", $grid, \"fdk\": {}, \"rings\": true}" after name
+	local -A words=([collimated]='no flat image to divide by' [integrals]='as where line integrals were made with')
 	reconstruct "$work/good" "$recipe"
 	expect_json '[.warnings[] | select(.code == "detector_shadow")] | length == 0'
 	get_volume final "$work/good.nii"
 	for name in collimated integrals; do
 		reconstruct "$work/$name" "$rings"
-		shadow_told
+		shadow_told "${words[$name]}"
 		expect_json '[.warnings[] | select(.code == "rings")] | length == 1'
 		expect_json '[.warnings[] | select(.code == "truncated" or .code == "stuck_pixels")] | length == 0'
 		after=$(digest)
@@ -112,7 +114,7 @@ test_edges_behind_a_collimator_are_told_and_left_out() {
 		post_job "$rings"
 		post_projections "$work/$name"
 		wait_job succeeded
-		shadow_told
+		shadow_told "${words[$name]}"
 		[ "$(digest)" = "$after" ] || fail "the bits of the job that came after its projections"
 	done
 }

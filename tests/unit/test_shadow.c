@@ -15,12 +15,26 @@ static const float FLAT = 60000;
 
 /*
  * HEAD ends within the detector, WIDE nowhere; DISCS are seen edge on, as wide as the detector; the PLATE that a body
- * stands on is wider than the field and seen from above, the TUBE's wall lies just outside of it.
+ * stands on is wider than the field and seen from above, the TUBE's wall lies just outside of it; a ROD stands in a
+ * PIPE.
  */
-enum object { HEAD, WIDE, DISCS, METAL, FLAT_END, PLATE, TUBE, NEAR_TUBE, TUBE_ASIDE, BROAD_DISC, OBJECTS };
+enum object {
+	HEAD,
+	WIDE,
+	DISCS,
+	METAL,
+	FLAT_END,
+	PLATE,
+	TUBE,
+	NEAR_TUBE,
+	TUBE_ASIDE,
+	BROAD_DISC,
+	ROD_IN_PIPE,
+	OBJECTS
+};
 static const char *const names[] = {
-    "head",  "wide body", "discs",       "metal",      "wide body that ends in the middle",
-    "plate", "tube",      "tube nearer", "tube aside", "disc",
+    "head",        "wide body",  "discs", "metal",         "wide body that ends in the middle", "plate", "tube",
+    "tube nearer", "tube aside", "disc",  "rod in a pipe",
 };
 static const struct ellipsoid objects[OBJECTS][PARTS_MOST] = {
     [HEAD] = {{.shape = SHAPE_ELLIPSOID, .semi_axes = {72, 84, 110}, .density = .035},
@@ -47,6 +61,9 @@ static const struct ellipsoid objects[OBJECTS][PARTS_MOST] = {
     [TUBE_ASIDE] = {{.shape = SHAPE_ELLIPSOID, .semi_axes = {72, 84, 110}, .density = .02},
 		    {.shape = SHAPE_CYLINDER, .semi_axes = {130, 130, 400}, .centre = {15, 0, 0}, .density = .04},
 		    {.shape = SHAPE_CYLINDER, .semi_axes = {122, 122, 400}, .centre = {15, 0, 0}, .density = -.04}},
+    [ROD_IN_PIPE] = {{.shape = SHAPE_CYLINDER, .semi_axes = {54, 54, 80}, .density = .0192},
+		     {.shape = SHAPE_CYLINDER, .semi_axes = {40, 40, 80}, .density = -.0192},
+		     {.shape = SHAPE_CYLINDER, .semi_axes = {16, 16, 80}, .density = .0205}},
     [BROAD_DISC] = {{.shape = SHAPE_CYLINDER, .semi_axes = {60, 60, 50}, .density = .0192},
 		    {.shape = SHAPE_CYLINDER, .semi_axes = {300, 300, 12}, .centre = {0, 0, -62}, .density = .0192}},
 };
@@ -87,11 +104,12 @@ static void make_view(const struct scene *scene, int view, const struct leaf *le
 	}
 }
 
-/* Whether there is a shadow; line integrals where `integrals`. */
-static int find(enum object object, const struct leaf *leaf, double photons, double arc, bool integrals,
-		struct shadow_found *ret_found)
+/* Whether there is a shadow on a detector that is displaced by so many mm; line integrals where `integrals`. */
+static int find(enum object object, const struct leaf *leaf, double displaced, double photons, double arc,
+		bool integrals, struct shadow_found *ret_found)
 {
-	const struct orbit_spec spec = {COLUMNS, ROWS, VIEWS, {620, 1100, {5, 5}, {0, 0}, {0, 0}}, 7, arc / VIEWS};
+	const struct orbit_spec spec = {COLUMNS, ROWS,       VIEWS, {620, 1100, {5, 5}, {displaced, 0}, {0, 0}},
+					7,       arc / VIEWS};
 	struct linearise linearise = {.quantity = integrals ? QUANTITY_LINE_INTEGRAL : QUANTITY_INTENSITY,
 				      .air = (double)FLAT};
 	struct phantom phantom = {.parts = (struct ellipsoid *)objects[object]};
@@ -137,7 +155,7 @@ START_TEST(a_shadow_is_found_to_the_pixel)
 		for (int noise = 0; noise < 2; noise++)
 			for (int integrals = 0; integrals < 2; integrals++) {
 				struct shadow_found found = {0};
-				const int code = find(seen[k], leaf, photons_of[noise], noise == 0 ? 200 : 360,
+				const int code = find(seen[k], leaf, 0, photons_of[noise], noise == 0 ? 200 : 360,
 						      integrals == 1, &found);
 
 				ck_assert_msg(code == 1 &&
@@ -159,11 +177,39 @@ START_TEST(an_object_is_no_shadow)
 		for (int integrals = 0; integrals < 2; integrals++) {
 			struct shadow_found found;
 
-			ck_assert_msg(find((enum object)_i, &none, photons_of[noise], noise == 0 ? 200 : 360,
+			ck_assert_msg(find((enum object)_i, &none, 0, photons_of[noise], noise == 0 ? 200 : 360,
 					   integrals == 1, &found) == 0,
 				      "%s, %g photons: columns %d %d, rows %d %d", names[_i], photons_of[noise],
 				      found.before[0], found.behind[0], found.before[1], found.behind[1]);
 		}
+}
+END_TEST
+
+/*
+ * A detector that is displaced sees what looks the same from all sides end once on either side of the axis: it is no
+ * shadow. A collimator is, on the near side of the axis as on the far one, and whatever it stands before.
+ */
+START_TEST(a_displaced_detector_sees_an_object_on_both_sides_of_the_axis)
+{
+	static const struct leaf none = {{0, 0}, {0, 0}, 1},
+				 leaves[] = {{{6, 0}, {0, 0}, .3}, {{0, 0}, {5, 0}, .3}, {{12, 0}, {4, 5}, .05}};
+	static const double displaced[] = {60, 90, 120, -90};
+	struct shadow_found found;
+
+	for (int integrals = 0; integrals < 2; integrals++) {
+		for (int object = 0; object < OBJECTS; object++)
+			ck_assert_msg(
+			    find((enum object)object, &none, displaced[_i], 1e6, 360, integrals == 1, &found) == 0,
+			    "%s: columns %d %d, rows %d %d", names[object], found.before[0], found.behind[0],
+			    found.before[1], found.behind[1]);
+		for (size_t i = 0; i < sizeof(leaves) / sizeof(*leaves); i++)
+			ck_assert_msg(find(ROD_IN_PIPE, &leaves[i], displaced[_i], 1e6, 360, integrals == 1, &found) ==
+					      1 &&
+					  memcmp(found.before, leaves[i].before, sizeof(found.before)) == 0 &&
+					  memcmp(found.behind, leaves[i].behind, sizeof(found.behind)) == 0,
+				      "leaf %zu: columns %d %d, rows %d %d", i, found.before[0], found.behind[0],
+				      found.before[1], found.behind[1]);
+	}
 }
 END_TEST
 
@@ -175,6 +221,7 @@ Suite *shadow_suite(void)
 	tcase_set_timeout(tests, 60);
 	tcase_add_loop_test(tests, a_shadow_is_found_to_the_pixel, 0, 8);
 	tcase_add_loop_test(tests, an_object_is_no_shadow, 0, OBJECTS);
+	tcase_add_loop_test(tests, a_displaced_detector_sees_an_object_on_both_sides_of_the_axis, 0, 4);
 	suite_add_tcase(suite, tests);
 	return suite;
 }
