@@ -470,8 +470,8 @@ static int smooth_less(const struct correction_job *job, const struct smoothing 
 
 /*
  * Without what lies outside of it the object ends with the grid, in faces as sharp as in SART's own projections. A mean
- * over those takes 60 to 100 HU of the last slices. p' = p - (A w - A u), see exterior.h; so the mean is of p - A w,
- * which has no faces, and A u, which has them, stays as it is.
+ * over those takes 60 to 100 HU of the last slices. p' = p - (A w - A u), see exterior.h; so the mean is of p' - A u,
+ * u being smoothed, which has no faces, and A u, which has them and little else, stays as it is.
  */
 static int average_beside_exterior(const struct correction_job *job, const struct smoothing *by, struct error *err)
 {
@@ -480,9 +480,13 @@ static int average_beside_exterior(const struct correction_job *job, const struc
 	const int all = geometry->count, slots = slots_of(geometry);
 	float *to = malloc((size_t)slots * (size_t)geometry->columns * (size_t)geometry->rows * sizeof(float));
 	struct stack *inside = NULL, *less = NULL;
-	int code = to != NULL ? exterior_volume_sample(job->exterior, &job->recipe->grid, job->work, err)
-			      : error_set(err, ERR_NO_MEMORY, "no memory for %d projections", slots);
+	int code = 0;
 
+	if (to == NULL)
+		code = error_set(err, ERR_NO_MEMORY, "no memory for %d projections", slots);
+	exterior_volume_smooth(job->exterior);
+	if (code == 0)
+		code = exterior_volume_sample(job->exterior, &job->recipe->grid, job->work, err);
 	if (code == 0)
 		code = backend->stack_new(job->device, geometry->columns, geometry->rows, slots, &inside, err);
 	if (code == 0)

@@ -100,6 +100,36 @@ void exterior_volume_hold_rim(struct exterior_volume *s, const struct orbit *orb
 			}
 }
 
+/* (1 2 1) / 4 along a line of voxels, in place, outer values held. */
+static void smooth_line(float *line, int count, size_t stride)
+{
+	float before = line[0];
+
+	for (int i = 0; i < count; i++) {
+		float *here = line + (size_t)i * stride;
+		const float is = *here, next = i + 1 < count ? here[stride] : is;
+
+		*here = 0.25f * (before + 2 * is + next);
+		before = is;
+	}
+}
+
+void exterior_volume_smooth(struct exterior_volume *s)
+{
+	const int *count = s->grid.size;
+	const size_t stride[3] = {1, (size_t)count[0], (size_t)count[0] * (size_t)count[1]};
+
+	for (int axis = 0; axis < 3; axis++) {
+		const int a = axis == 0 ? 1 : 0, b = axis == 2 ? 1 : 2;
+
+#pragma omp parallel for schedule(static)
+		for (int j = 0; j < count[b]; j++)
+			for (int i = 0; i < count[a]; i++)
+				smooth_line(s->voxels + (size_t)j * stride[b] + (size_t)i * stride[a], count[axis],
+					    stride[axis]);
+	}
+}
+
 int exterior_volume_sample(const struct exterior_volume *s, const struct grid *grid, struct volume *to,
 			   struct error *err)
 {
