@@ -28,7 +28,7 @@ static const struct asset *asset_find(const char *name)
 
 static int reply_asset(struct request *request, const struct asset *asset, const char *caching, struct error *err)
 {
-	bool gzip = accepts_coding(request_header(request, "Accept-Encoding"), "gzip");
+	bool gzip = request_prefers_coding(request, "gzip");
 	char etag[64];
 	struct entity entity = {
 	    .etag = etag, .size = UNKNOWN_SIZE, .media_type = asset->media_type, .caching = caching};

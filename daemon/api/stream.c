@@ -300,7 +300,7 @@ static int stream_new(struct api *api, struct request *request, struct job *job,
 	stream->job = job;
 	job_facts(job, &stream->facts);
 	snprintf(stream->boundary, sizeof(stream->boundary), "%016llx%016llx", random[0], random[1]);
-	stream->zstd = accepts_coding(request_header(request, "Accept-Encoding"), "zstd");
+	stream->zstd = request_prefers_coding(request, "zstd");
 	stream->watch = (struct watch){.wake = wake_stream, .context = request};
 	stream->made = stream->watch;
 	job_watch(job, &stream->watch);

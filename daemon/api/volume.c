@@ -455,10 +455,10 @@ int volume_get(void *context, struct request *request, struct error *err)
 	struct job_facts facts;
 	struct entity entity;
 	char etag[160], filename[VOLUME_FILENAME_MAX];
-	const char *accepted = request_header(request, "Accept-Encoding");
 	/* A frame of zstd cannot be entered in the middle: a range is of the plain bytes, where they are acceptable. */
-	bool zstd = accepts_coding(accepted, "zstd") && (request_header(request, "Range") == NULL ||
-							 request_is_head(request) || !accepts_identity(accepted));
+	bool zstd =
+	    request_prefers_coding(request, "zstd") &&
+	    (request_header(request, "Range") == NULL || request_is_head(request) || !request_takes_plain(request));
 	bool packed, replied = false;
 	int code;
 

@@ -116,6 +116,13 @@ const char *request_target(const struct request *request);
 const char *request_query(const struct request *request, const char *name);
 /* The first header of that name, or NULL. */
 const char *request_header(struct request *request, const char *name);
+/*
+ * What its Accept-Encoding wants, on however many lines (RFC 9110, 12.5.3). prefers: a coding (zstd, gzip) rather than
+ * the plain bytes: it names it with a weight that is above 0 and not below that of the plain bytes; or "*" alone takes
+ * it in, with more weight than those have. takes_plain: only "identity;q=0", or "*;q=0" without identity, refuses them.
+ */
+bool request_prefers_coding(struct request *request, const char *coding);
+bool request_takes_plain(struct request *request);
 bool request_is_head(const struct request *request);
 /* -1: not known (chunked). */
 int64_t request_content_length(const struct request *request);

@@ -431,6 +431,50 @@ const char *request_header(struct request *request, const char *name)
 	return MHD_lookup_connection_value(request->mhd, MHD_HEADER_KIND, name);
 }
 
+/* A name that is sought in all lines of Accept-Encoding, and the first weight that one of them gives to it. */
+struct sought {
+	const char *coding;
+	double weight;
+};
+
+static enum MHD_Result seek_coding(void *context, enum MHD_ValueKind kind, const char *name, const char *value)
+{
+	struct sought *sought = context;
+
+	(void)kind;
+	if (value != NULL && sought->weight < 0 && strcasecmp(name, "Accept-Encoding") == 0)
+		sought->weight = coding_weight(value, sought->coding);
+	return MHD_YES;
+}
+
+/* Negative where no line names it. */
+static double weight_of(struct request *request, const char *coding)
+{
+	struct sought sought = {.coding = coding, .weight = -1};
+
+	MHD_get_connection_values(request->mhd, MHD_HEADER_KIND, seek_coding, &sought);
+	return sought.weight;
+}
+
+static double weight_of_plain(struct request *request)
+{
+	const double weight = weight_of(request, "identity");
+
+	return weight >= 0 ? weight : weight_of(request, "*");
+}
+
+bool request_prefers_coding(struct request *request, const char *coding)
+{
+	const double weight = weight_of(request, coding), plain = weight_of_plain(request);
+
+	return weight >= 0 ? weight > 0 && weight >= plain : plain >= 0 && weight_of(request, "*") > plain;
+}
+
+bool request_takes_plain(struct request *request)
+{
+	return weight_of_plain(request) != 0;
+}
+
 bool request_is_head(const struct request *request)
 {
 	return strcmp(request->method, "HEAD") == 0;

@@ -2,7 +2,6 @@
 #include "daemon/http/text.h"
 
 #include <ctype.h>
-#include <math.h>
 #include <stdlib.h>
 #include <string.h>
 #include <strings.h>
@@ -95,43 +94,42 @@ enum range range_parse(const char *header, uint64_t size, uint64_t *ret_first, u
 	return RANGE_ONE;
 }
 
-/* The quality that an Accept-Encoding gives to this name; negative where it does not name it. */
-static double coding_quality(const char *header, const char *coding)
+/* A weight by the letter of RFC 9110, 12.4.2: 0 or 1 and up to three decimals. Negative for anything else. */
+static double parse_weight(const char *text, size_t length)
 {
-	if (header == NULL)
-		return -1;
-	while (*header != '\0') {
-		size_t length;
-		const char *parameter;
+	double weight, unit = 1;
 
-		header = header + strspn(header, " \t,");
+	if (length == 0 || length > 5 || (text[0] != '0' && text[0] != '1') || (length > 1 && text[1] != '.'))
+		return -1;
+	weight = text[0] - '0';
+	for (size_t i = 2; i < length; i++) {
+		if (text[i] < '0' || text[i] > '9')
+			return -1;
+		unit /= 10;
+		weight += (text[i] - '0') * unit;
+	}
+	return weight <= 1 ? weight : -1;
+}
+
+double coding_weight(const char *header, const char *coding)
+{
+	while (*header != '\0') {
+		size_t length, weight;
+
+		header += strspn(header, " \t,");
 		length = strcspn(header, " \t,;");
-		parameter = header + strcspn(header, ",;");
 		if (length == strlen(coding) && strncasecmp(header, coding, length) == 0) {
-			if (*parameter != ';')
+			header = skip_blanks(header + length);
+			if (*header != ';')
 				return 1;
-			parameter = skip_blanks(parameter + 1);
-			return strncasecmp(parameter, "q=", 2) == 0 ? fmax(strtod(parameter + 2, NULL), 0) : 1;
+			header = skip_blanks(header + 1);
+			weight = strcspn(header, " \t,");
+			return weight > 2 && strncasecmp(header, "q=", 2) == 0 ? parse_weight(header + 2, weight - 2)
+									       : -1;
 		}
 		header += strcspn(header, ",");
 	}
 	return -1;
-}
-
-bool accepts_coding(const char *header, const char *coding)
-{
-	const double quality = coding_quality(header, coding);
-
-	return quality > 0 && quality >= coding_quality(header, "identity");
-}
-
-bool accepts_identity(const char *header)
-{
-	double quality = coding_quality(header, "identity");
-
-	if (quality < 0)
-		quality = coding_quality(header, "*");
-	return quality != 0;
 }
 
 bool etag_in(const char *header, const char *etag, bool weak)

@@ -23,11 +23,9 @@ enum range {
 };
 enum range range_parse(const char *header /* or NULL */, uint64_t size, uint64_t *ret_first, uint64_t *ret_length);
 
-/* Whether an Accept-Encoding names this coding (zstd, gzip) with a quality above 0, and not below one that it gives to
- * identity (RFC 9110, 12.5.3). NULL: no. */
-bool accepts_coding(const char *header, const char *coding);
-/* Whether it leaves the plain bytes acceptable (RFC 9110, 12.5.3): only "identity;q=0", or "*;q=0" alone, does not. */
-bool accepts_identity(const char *header);
+/* The weight that one line of Accept-Encoding gives to a coding, or to "*" (RFC 9110, 12.5.3); negative where it does
+ * not name it, or gives none that is one. */
+double coding_weight(const char *header, const char *coding);
 
 /*
  * Whether a list of entity tags, or *, has this one (a strong one, quoted). weak:

@@ -55,7 +55,7 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
 	check_range(text, UINT64_MAX);
 	check_numbers(text, length);
 	check_names(text, length);
-	accepts_coding(text, "zstd");
+	coding_weight(text, "zstd");
 	etag_in(text, "\"tag\"", false);
 	etag_in(text, "\"tag\"", true);
 	if (content_digest_parse(text, &given, digest, &err) != 0)

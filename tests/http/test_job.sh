@@ -209,15 +209,20 @@ test_volumes_come_in_every_format() {
 	zstd -q -d -c <"$body" | cmp - "$work/v.nii" || fail "the same bytes through zstd"
 	etag=$(header etag)
 	# what a client would rather have
-	for coding in "zstd;q=0.5, identity" "identity;q=0.2, zstd;q=0.1" "zstd;q=0"; do
+	for coding in "zstd;q=0.5, identity" "identity;q=0.2, zstd;q=0.1" "zstd;q=0" "*" "zstd;q=0.3, *" "*;q=0" "zstd;q=nan" "zstd;q=2" "zstd;q=0.1234" "zstd;p=1"; do
 		req GET "/v1/jobs/$job/volumes/final" -H "Accept-Encoding: $coding"
 		[ -z "$(header content-encoding)" ] || fail "plain bytes for $coding"
 		cmp "$body" "$work/v.nii" || fail "the plain bytes for $coding"
 	done
-	for coding in "zstd, identity" "zstd;q=0.5, identity;q=0.5" "identity;q=0, zstd;q=0.001"; do
+	for coding in "zstd, identity" "zstd;q=0.5, identity;q=0.5" "identity;q=0, zstd;q=0.001" "*, identity;q=0" "identity;q=0.5, *" "gzip;q=0, Zstd ; q=1.000"; do
 		req GET "/v1/jobs/$job/volumes/final" -H "Accept-Encoding: $coding"
 		[ "$(header content-encoding)" = zstd ] || fail "zstd for $coding"
 	done
+	# several lines are one list
+	req GET "/v1/jobs/$job/volumes/final" -H 'Accept-Encoding: gzip' -H 'Accept-Encoding: zstd'
+	[ "$(header content-encoding)" = zstd ] || fail "zstd of the second line"
+	req GET "/v1/jobs/$job/volumes/final" -H 'Accept-Encoding: zstd;q=0.5' -H 'Accept-Encoding: identity'
+	[ -z "$(header content-encoding)" ] || fail "plain bytes, which the second line would rather have"
 	req GET "/v1/jobs/$job/volumes/final"
 	[ "$(header etag)" != "$etag" ] || fail "another ETag for another encoding"
 	etag=$(header etag)
