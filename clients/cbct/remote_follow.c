@@ -231,14 +231,23 @@ static int keep_checkpoint(struct remote *remote, struct error *err)
 	return code == 0 ? remote_tell(remote, &message, err) : code;
 }
 
+/* Whether a worker has it, and it waits for nothing but that. */
+static bool waits_for_worker(const cJSON *job)
+{
+	const cJSON *list = cJSON_GetObjectItemCaseSensitive(job, "waiting_for");
+	const char *only = cJSON_GetStringValue(cJSON_GetArrayItem(list, 0));
+
+	return member_text(job, "stage", NULL) != NULL && cJSON_GetArraySize(list) == 1 && only != NULL &&
+	       strcmp(only, "worker") == 0;
+}
+
 /*
  * A job that has been sent all that it needs, and still waits for something, or for somebody to take it in: something
- * was lost there. One whose worker is slower than the way waits for nothing until it has come to the last.
+ * was lost there. One whose worker is slower than the way waits for that one alone until it has come to the last.
  */
 static int heed_waiting(struct remote *remote, const cJSON *job, bool waits, struct error *err)
 {
-	const bool attended = member_text(job, "stage", NULL) != NULL &&
-			      cJSON_GetArraySize(cJSON_GetObjectItemCaseSensitive(job, "waiting_for")) == 0;
+	const bool attended = waits_for_worker(job);
 
 	if (!waits || attended || remote->sent < remote->files.scan->count) {
 		remote->waits = 0;

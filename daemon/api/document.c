@@ -337,7 +337,7 @@ static int add_views(cJSON *document, const struct scan_facts *scan, struct job 
 	return 0;
 }
 
-/* Adds the names of all that a job waits for before it can begin; an empty list for any other job. */
+/* Adds the names of all that a job waits for before it can begin, one at least; an empty list for any other job. */
 static void add_waiting_for(cJSON *document, const struct scan_facts *scan, const struct job_record *record,
 			    struct job *job)
 {
@@ -363,7 +363,8 @@ static void add_waiting_for(cJSON *document, const struct scan_facts *scan, cons
 	}
 	if (obstacle != JOB_UNHINDERED)
 		json_append(list, cJSON_CreateString(job_obstacle_names[obstacle]));
-	else if (record->state == JOB_QUEUED)
+	else if (waits &&
+		 cJSON_GetArraySize(list) == 0) /* its turn, or that its worker comes to what has just arrived */
 		json_append(list, cJSON_CreateString("worker"));
 	job_wait_text(job, text);
 	if (text[0] != '\0' && obstacle != JOB_NO_HOST)

@@ -149,7 +149,7 @@ def wait_for(daemon, job, seconds=120):
         status, body = daemon.get(f"/v1/jobs/{job}?wait=0.1")
         document = json.loads(body)
         if (status != 200 or document["state"] in ("succeeded", "failed", "cancelled")
-                or (waits(document) and document["waiting_for"] != ["check"])): # which ends by itself
+                or (waits(document) and document["waiting_for"] not in (["check"], ["worker"]))): # which end by themselves
             return status, body
         if time.monotonic() > end:
             raise Gone(f"job {job} does not end")

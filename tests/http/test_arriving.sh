@@ -237,6 +237,23 @@ test_an_urgent_scan_has_the_worker_that_was_long_in_making_room() {
 	expect_json '.state == "cancelled"'
 }
 
+test_a_job_whose_projections_are_all_there_waits_for_its_worker() {
+	rm -rf "$state"
+	local hang=$work/hang
+	CBCT_TEST_HANG=$hang start_daemon --worker "$BUILD/cbct-worker-held"
+	post_scan "$scan_dir"
+	post_job "$fdk"
+	send "$scan_dir" 0 9
+	reconstructed 10
+	: >"$hang"
+	send "$scan_dir" 10 59
+	req GET "/v1/jobs/$job"
+	expect_json '.state == "waiting" and .views.received == 60 and .views.reconstructed < 60 and .waiting_for == ["worker"]'
+	rm "$hang"
+	wait_job succeeded
+	expect_json '.waiting_for == []'
+}
+
 test_cancel_and_delete_while_it_waits() {
 	fresh_daemon
 	local worker
