@@ -35,30 +35,60 @@ static float mean_of(const float *p, int count)
 	return good > 0 ? sum / (float)good : NAN;
 }
 
-/* The means of the first two places and of the last two, over the rows in which all are good. */
-static void means_of_ends(float means[][4], int rows, float ret_ends[2])
+static float near_of(float level)
 {
-	for (int end = 0; end < 2; end++) {
-		float sum = 0;
-		int good = 0;
+	return fminf(SHARE * fabsf(level), SHARE_MOST) + NOISE;
+}
 
-		for (int i = 0; i < rows; i++) {
-			const float mean = 0.5f * (means[i][2 * end] + means[i][2 * end + 1]);
+/* True if nearly all rows have the level at the places first .. last. */
+static bool is_level(float means[][4], int rows, int first, int last, float level)
+{
+	int agree = 0;
 
-			sum += isnan(mean) ? 0 : mean;
-			good += !isnan(mean);
-		}
-		ret_ends[end] = good > 0 ? sum / (float)good : 0;
+	for (int i = 0; i < rows; i++) {
+		bool same = true;
+
+		for (int k = first; k <= last; k++)
+			same = same && fabsf(means[i][k] - level) <= near_of(level);
+		agree += same;
 	}
+	return (float)agree >= NEARLY_ALL * (float)rows;
+}
+
+/* The mean over the places first .. last of all rows, where any of them is good. */
+static float mean_of_places(float means[][4], int rows, int first, int last)
+{
+	float sum = 0;
+	int good = 0;
+
+	for (int i = 0; i < rows; i++)
+		for (int k = first; k <= last; k++)
+			if (!isnan(means[i][k])) {
+				sum += means[i][k];
+				good++;
+			}
+	return good > 0 ? sum / (float)good : NAN;
+}
+
+/* Both places have it; what is about 0 in the mean may be noise in each row. */
+static float level_of_end(float means[][4], int rows, int first)
+{
+	const float level = mean_of_places(means, rows, first, first + 1);
+	const float apart =
+	    mean_of_places(means, rows, first, first) - mean_of_places(means, rows, first + 1, first + 1);
+	const bool air = fabsf(level) < LEAST && fabsf(apart) <= NOISE;
+
+	return air || is_level(means, rows, first, first + 1, level) ? level : NAN;
 }
 
 float air_level(const float *view, int columns, int rows, int edge, float largest, float ret_ends[2])
 {
 	const int looked_at = rows < LOOKED_AT ? rows : LOOKED_AT,
 		  places[] = {0, edge, columns - 2 * edge, columns - edge};
-	float means[LOOKED_AT][4], sum = 0, near;
-	int good = 0, agree = 0;
+	float means[LOOKED_AT][4], level;
 
+	for (int end = 0; end < 2 && ret_ends != NULL; end++)
+		ret_ends[end] = NAN;
 	if (columns < 4 * edge)
 		return 0;
 	for (int i = 0; i < looked_at; i++)
@@ -66,27 +96,13 @@ float air_level(const float *view, int columns, int rows, int edge, float larges
 			const int row = (int)((long long)i * rows / looked_at);
 
 			means[i][k] = mean_of(view + (long long)row * columns + places[k], edge);
-			if (!isnan(means[i][k])) {
-				sum += means[i][k];
-				good++;
-			}
 		}
-	if (good == 0 || fabsf(sum) < LEAST * (float)good || sum > MOST * (float)good)
+	for (int end = 0; end < 2 && ret_ends != NULL; end++)
+		ret_ends[end] = level_of_end(means, looked_at, 2 * end);
+	level = mean_of_places(means, looked_at, 0, 3);
+	if (isnan(level) || fabsf(level) < LEAST || level > MOST)
 		return 0;
-	sum /= (float)good;
-	near = fminf(SHARE * fabsf(sum), SHARE_MOST) + NOISE;
-	if (sum > -MOST && fabsf(sum) > LITTLE * largest)
+	if (level > -MOST && fabsf(level) > LITTLE * largest)
 		return 0;
-	for (int i = 0; i < looked_at; i++) {
-		bool same = true;
-
-		for (int k = 0; k < 4; k++)
-			same = same && fabsf(means[i][k] - sum) <= near;
-		agree += same;
-	}
-	if ((float)agree < NEARLY_ALL * (float)looked_at)
-		return 0;
-	if (ret_ends != NULL)
-		means_of_ends(means, looked_at, ret_ends);
-	return sum;
+	return is_level(means, looked_at, 0, 3, level) ? level : 0;
 }

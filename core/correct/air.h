@@ -8,8 +8,9 @@
  *
  * view: line integrals [row][column], NAN where there is none; about 64 of the rows are looked at. edge: columns at an
  * end whose mean is taken, truncation_edge of the detector; the next ones are held against it, so that 4 * edge columns
- * at least are needed. largest: truncation_largest of the view; air is little beside it. ret_ends, NULL is fine: the
- * means at the first columns and at the last ones, where there is a level.
+ * at least are needed. largest: truncation_largest of the view; air is little beside it. ret_ends, NULL is fine: what
+ * the first columns alone have in nearly all rows, and the last ones, whatever it is; NAN where the rows differ, but
+ * about 0, where noise is more than that.
  */
 float air_level(const float *view, int columns, int rows, int edge, float largest, float ret_ends[2]);
 #endif

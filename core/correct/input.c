@@ -317,26 +317,6 @@ bool input_is_mended(const struct input *input, int view)
 	return false;
 }
 
-/* Adds up what was seen at the edges of the views that are taken as they are. */
-static void add_edges(struct input *input, int views)
-{
-	for (int view = 0; view < views; view++) {
-		const struct view_edges *edges = &input->edges[view];
-
-		if (!edges->looked_at || (input_is_mended(input, view) && input->steps[view].kind != STEP_NONE))
-			continue;
-		input->views_looked_at++;
-		for (int end = 0; end < 2; end++)
-			input->ends[end] += edges->ends[end];
-		if (edges->air == 0)
-			continue;
-		input->air_least = input->off == 0 ? edges->air : fminf(input->air_least, edges->air);
-		input->air_most = input->off == 0 ? edges->air : fmaxf(input->air_most, edges->air);
-		input->off++;
-		input->far_off += edges->far_off;
-	}
-}
-
 static void add_counts(struct defect_counts *counts, const struct defect_counts *view)
 {
 	counts->mapped += view->mapped;
@@ -579,7 +559,7 @@ static int add_outliers(struct input *input, bool *skip, const struct orbit *orb
 int input_settle(struct input *input, const struct orbit *orbit, bool keeps_all, struct error *err)
 {
 	bool *blank = blank_flags(input, orbit->count), *empty = calloc((size_t)orbit->count, sizeof(*empty));
-	int code = 0, found = 0;
+	int code = 0, found = 0, edges = 0;
 
 	if (input->views > 0 && input->counts.blank == input->views)
 		code = error_set(err, ERR_IMPOSSIBLE,
@@ -606,10 +586,11 @@ int input_settle(struct input *input, const struct orbit *orbit, bool keeps_all,
 		code = add_steps(input, blank, orbit, keeps_all, err);
 	if (code >= 0)
 		code = add_outliers(input, blank, orbit, keeps_all, err);
-	add_edges(input, orbit->count);
+	if (code >= 0)
+		edges = input_add_edges(input, orbit, err);
 	free(blank);
 	free(empty);
-	return code < 0 ? code : found + code;
+	return code < 0 ? code : edges < 0 ? edges : found + code;
 }
 
 int input_kept_in(const struct input *input, int views)

@@ -50,8 +50,8 @@ struct input {
 	 */
 	struct defect_counts *defects;
 	struct view_edges {
-		bool looked_at, ends[2], far_off;
-		float air, air_ends[2];
+		bool looked_at, ends[2], far_off, board;
+		float air, air_ends[2]; /* air_level */
 	} * edges;
 	/* [row][column], line integrals as FDK took them, of views that may be outliers, owned. */
 	struct {
@@ -168,18 +168,14 @@ int input_empty_slot(const struct input *input, const struct backend *backend, s
  */
 void input_goes_on(const struct input *input, bool ret_ends[2]);
 
+/* Adds up what was seen at the edges of the views that are taken as they are: part of input_settle. ERR_NO_MEMORY. */
+int input_add_edges(struct input *input, const struct orbit *orbit, struct error *err);
+
 /* The mean of p^2 of what the views show, without their noise; blank views count as nothing. */
 double input_shown(const struct input *input);
 
 /* The share of views in which air is so far from 0 that it does not pass for air: none of that is an object. */
 double input_air_off_share(const struct input *input);
-/*
- * Whether that air is none but a board wider than the detector, as a table: what it takes of a ray grows with the angle
- * from the board's normal, so that the two ends of the rows differ, one way on the one side of the normal, the other
- * way on the other. A tube that drifts does the same to both ends.
- */
-bool input_air_is_a_board(const struct input *input, const struct geometry *geometry);
-
 /* The share that blank views have in FDK's density on the axis, 0 .. 1. */
 double input_blank_share(const struct input *input, const struct orbit *orbit);
 

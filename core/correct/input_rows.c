@@ -200,10 +200,9 @@ static bool is_air_too_bright(const struct input *input)
 	return input->linearise.quantity == QUANTITY_INTENSITY && input->off > 0 && (double)input->air_least < NEGATIVE;
 }
 
-static void warn_of_air_level(const struct input *input, const struct geometry *geometry,
-			      const struct warning_sink *sink)
+static void warn_of_air_level(const struct input *input, const struct warning_sink *sink)
 {
-	if (input->off == 0 || input_air_is_a_board(input, geometry))
+	if (input->off == 0)
 		return;
 	if (is_air_too_bright(input)) {
 		warning_tell(
@@ -302,7 +301,7 @@ static int warn_of_unseen_slices(const struct correction_job *job, struct error 
 static int warn_of_samples(const struct correction_job *job, void *state, struct error *err)
 {
 	(void)state;
-	warn_of_air_level(job->input, job->geometry, job->warnings);
+	warn_of_air_level(job->input, job->warnings);
 	warn_of_line_integrals(job->input, job->warnings);
 	warn_of_no_object(job->input, job->warnings);
 	warn_of_bytes(job->input, job->warnings);

@@ -1760,14 +1760,31 @@ START_TEST(a_body_that_is_wholly_seen_is_not_called_cut_off)
 }
 END_TEST
 
-/* Seen along its normal it is as even at both ends of all rows as air would be behind a tube that gives less. */
+static const struct {
+	double arc, first;
+	double half, thick, away, density; /* of the board, half sides and its place */
+	bool drifts;
+} boards[] = {
+    {360, 20, 190, 5, 60, 0.01, false},     {205, 20, 190, 5, 60, 0.01, false},
+    {200, 185, 92, 2.8, 53, 0.0167, false}, {360, 20, 92, 2.8, 53, 0.0167, false},
+    {210, 40, 162, 3.8, -50, 0.012, false}, {360, 20, 190, 5, 60, 0.01, true},
+    {210, 40, 162, 3.8, -50, 0.012, true},
+};
+
+/*
+ * Seen along its normal it is as even at both ends of all rows as air would be behind a tube that gives less, in few
+ * views or many. A tube that does give less is told behind a board, too.
+ */
 START_TEST(a_board_wider_than_the_detector_is_no_dark_air)
 {
-	const double arc = _i ? 205 : 360;
-	const struct orbit_spec spec = {64, 24, 90, {620, 1100, {5, 5}, {0, 0}, {0, 0}}, 20, arc / 90};
+	const double arc = boards[_i].arc;
+	const struct orbit_spec spec = {64, 24, 90, {620, 1100, {5, 5}, {0, 0}, {0, 0}}, boards[_i].first, arc / 90};
 	struct ellipsoid parts[] = {
 	    {.shape = SHAPE_ELLIPSOID, .semi_axes = {45, 40, 60}, .density = 0.02},
-	    {.shape = SHAPE_BOX, .semi_axes = {190, 5, 200}, .centre = {0, 60, 0}, .density = 0.01},
+	    {.shape = SHAPE_BOX,
+	     .semi_axes = {boards[_i].half, boards[_i].thick, 200},
+	     .centre = {0, boards[_i].away, 0},
+	     .density = boards[_i].density},
 	};
 	struct phantom phantom = {.count = 2, .parts = parts};
 	struct grid grid = grid_of(16, 16, 4, 4, 4, 4);
@@ -1777,8 +1794,34 @@ START_TEST(a_board_wider_than_the_detector_is_no_dark_air)
 
 	scene_orbit(&scene, &spec);
 	scene_add(&scene, &phantom);
+	for (int i = 0; i < spec.views * spec.rows * spec.columns && boards[_i].drifts; i++)
+		scene.projections[i] += 0.1F * (float)(i / (spec.rows * spec.columns)) / (float)spec.views;
 	recipe.fdk.on = true;
 	run(&scene, &recipe, &outcome);
+	ck_assert_msg((strstr(outcome.warnings, "air_level: ") != NULL) == boards[_i].drifts, "%s", outcome.warnings);
+	outcome_clear(&outcome);
+	scene_clear(&scene);
+}
+END_TEST
+
+/* What is taken off or left out is not told as air that is off as well, of which nothing is taken out. */
+START_TEST(a_view_of_another_dose_is_told_once)
+{
+	const struct orbit_spec spec = {64, 32, 60, {600, 1100, {4, 4}, {0, 0}, {0, 0}}, 0, 6};
+	struct ellipsoid ball = {.shape = SHAPE_ELLIPSOID, .semi_axes = {50, 45, 40}, .density = 0.02};
+	struct phantom phantom = {.count = 1, .parts = &ball};
+	struct grid grid = grid_of(16, 16, 4, 4, 4, 4);
+	struct recipe recipe = recipe_on(&grid);
+	struct outcome outcome = {0};
+	struct scene scene;
+
+	scene_orbit(&scene, &spec);
+	scene_add(&scene, &phantom);
+	for (int i = 0; i < spec.columns * spec.rows; i++)
+		scene.projections[30 * spec.columns * spec.rows + i] -= logf(0.9F);
+	recipe.fdk.on = true;
+	run(&scene, &recipe, &outcome);
+	ck_assert_msg(strstr(outcome.warnings, "dose_steps: ") != NULL, "%s", outcome.warnings);
 	ck_assert_msg(strstr(outcome.warnings, "air_level: ") == NULL, "%s", outcome.warnings);
 	outcome_clear(&outcome);
 	scene_clear(&scene);
@@ -2347,7 +2390,8 @@ Suite *recon_suite(void)
 	suite_add_tcase(suite, images);
 
 	tcase_add_loop_test(truncation, truncation_leaves_no_rim_in_fdk_or_sart, 0, 5);
-	tcase_add_loop_test(truncation, a_board_wider_than_the_detector_is_no_dark_air, 0, 2);
+	tcase_add_test(truncation, a_view_of_another_dose_is_told_once);
+	tcase_add_loop_test(truncation, a_board_wider_than_the_detector_is_no_dark_air, 0, COUNT(boards));
 	tcase_add_loop_test(truncation, a_skull_with_air_beside_it_is_not_called_cut_off, 0, 3);
 	tcase_add_loop_test(truncation, a_body_that_is_wholly_seen_is_not_called_cut_off, 0, COUNT(whole));
 	tcase_add_loop_test(truncation, sart_alone_tells_of_truncation, 0, 2);
