@@ -13,6 +13,7 @@
 
 #include "daemon/dicom/dicom.h"
 #include "proto/json.h"
+#include "proto/version.h"
 
 enum { DAEMON = 3 /* descriptor */, TASK_MOST = 1 << 20, READINGS = 4 };
 
@@ -234,7 +235,7 @@ static void carry_out(const cJSON *task)
 	objects_close(&objects);
 }
 
-int main(void)
+int main(int argc, char **argv)
 {
 	const cJSON *worklist, *listening;
 	struct objects none = {.file = -1};
@@ -242,6 +243,8 @@ int main(void)
 	pthread_t watcher;
 	cJSON *task;
 
+	if (argc == 2 && strcmp(argv[1], "--version") == 0)
+		return puts("cbct-dicom " CBCT_VERSION) < 0;
 	signal(SIGPIPE, SIG_IGN);
 	signal(SIGALRM, give_up);
 	task = read_task(&err);

@@ -302,7 +302,7 @@ test_dicom_tells_how_the_patient_lies() {
 		(cd "$work" && dump2dcm --quiet "$name.dump" "$name.dcm")
 		cbct import "$work/$name.dcm" "${how[@]}" -o "$work/$name" 2>"$work/said"
 	}
-	for position in HFS HFP FFS FFDR; do
+	for position in HFS HFP FFS FFP HFDL HFDR FFDL FFDR; do
 		xa "lies$position" patient=$position
 		jq -e ".patient == {position: \"$position\", name: \"Müller^Test\"}" "$work/lies$position/scan.json" >/dev/null || fail "$position in $(head -c 200 "$work/lies$position/scan.json")"
 		cbct recon "$work/lies$position" --fdk hann --grid 42,42,42 --spacing 2 --quiet -o "$work/lies$position" >/dev/null

@@ -544,7 +544,7 @@ test_two_daemons_do_not_share_a_state_directory() {
 test_settings_as_flag_line_and_environment() {
 	[[ $("$BUILD/cbctd" --help) == *--state-dir* ]] || fail "--help with --state-dir"
 	local name
-	for name in cbctd cbct-worker cbct cbct-cuda; do
+	for name in cbctd cbct-worker cbct cbct-cuda cbct-dicom; do
 		[ -x "$BUILD/$name" ] || continue
 		[[ $("$BUILD/$name" --version) =~ ^$name\ [0-9]+\.[0-9]+\.[0-9]+$ ]] || fail "the version of $name"
 	done

@@ -52,6 +52,7 @@ test_a_reload_takes_the_level_of_the_log_and_tells_what_has_to_wait() {
 	log_has 'the settings that were read before stay: .*cbctd.conf:1: log-level: "loud"'
 	req GET /livez
 	expect_status 200
+	[ "$(cat "$body")" = "alive, $("$BUILD/cbctd" --version)" ] || fail "the version, got $(cat "$body")"
 }
 log_has() { # PATTERN
 	local i

@@ -49,6 +49,8 @@ test('who may view sees volumes, events and downloads, and is offered nothing mo
 	await page.click('.brand')
 	await page.waitForSelector('.live[data-state=on]')
 	await page.waitForSelector(`.jobs a[href="#/jobs/${finished}"]`)
+	await until('what was set aside', () => page.textContent('.status'), text => text.includes('1 set aside in quarantine'))
+	expect(/^jobs\/1m7yam2f9rgevqe7: ./.test(await page.locator('.devices.bad', { hasText: 'quarantine' }).getAttribute('title')), 'which, and why')
 	expect(await page.locator('.acquires:visible').count() === 0, 'no button in the lists')
 	await page.context().close()
 })

@@ -142,6 +142,9 @@ browser_tests() {
 	VIEW=$(cbct token new ward --role view --file "$work/tokens" 2>/dev/null)
 	ACQUIRE=$(cbct token new arm-3 --role acquire --file "$work/tokens" 2>/dev/null)
 	ADMIN=$(cbct token new office --role admin --file "$work/tokens" 2>/dev/null)
+	# what no record tells of is set aside, and the page says so
+	mkdir "$state/jobs/1m7yam2f9rgevqe7"
+	echo something >"$state/jobs/1m7yam2f9rgevqe7/final.nii"
 	start_daemon --threads 1 --tokens "$work/tokens" --keep 86400 --max-jobs 5 --client-bytes 1G --max-bytes 2G
 	VIEW=$VIEW ACQUIRE=$ACQUIRE ADMIN=$ADMIN URL=$url OUT=$work SCAN=$scan FINISHED=$job CHROMIUM=$CHROMIUM HOME=$work timeout -k 20 300 node "$tools/access.mjs" 2>&1 | tee -a "$work/browser.log"
 	status=$((status + PIPESTATUS[0]))
