@@ -5,9 +5,11 @@ Usage: exchanges.py openapi.json FILE ...
 
 A failure: a path, method, status, media type, header or query parameter that the schema does not have; a header that
 comes twice; a JSON body or event that does not fit its schema or has a member that it does not name; a request that was
-accepted though the schema forbids it. Operations that no test has exercised are reported.
+accepted though the schema forbids it; a warning that is told twice, or of a scan and of its job. Operations that no test
+has exercised are reported.
 """
 import collections
+import itertools
 import json
 import re
 import sys
@@ -116,6 +118,7 @@ class Judge:
         self.document = document
         self.exercised: Set[Tuple[str, str]] = set()
         self.seen: Set[Tuple[str, str, str]] = set()
+        self.told: Dict[str, Set[str]] = {}  # codes of the warnings of each scan, as it was last seen
 
     def body(self, schema: Schema, exchange: Exchange, text: str) -> Iterator[str]:
         if text == "":
@@ -170,6 +173,22 @@ class Judge:
                     for error in self.body(kinds[event["event"]], exchange, event["data"]):
                         yield f"event {event['event']} {error}"
 
+    def once(self, exchange: Exchange) -> Iterator[str]:
+        """A fact is told once: no warning twice in a document, and no code in a job's and in its scan's."""
+        try:
+            document = json.loads(exchange.body)
+            warnings = [(warning["code"], warning["detail"]) for warning in document["warnings"]]
+        except (ValueError, KeyError, TypeError):
+            return
+        for code, _ in sorted({warning for warning in warnings if warnings.count(warning) > 1}):
+            yield f"the warning {code} is told twice"
+        codes = {code for code, _ in warnings}
+        if "scan" in document:
+            for code in sorted(self.told.get(document["scan"], set()) & codes):
+                yield f"the warning {code} is told of the scan and of its job"
+        elif "id" in document:
+            self.told[document["id"]] = codes
+
     def judge(self, exchange: Exchange) -> Iterator[str]:
         template = self.document.path(exchange.path)
         if template is None:
@@ -213,7 +232,7 @@ def main() -> int:
             for line in dict.fromkeys(file):
                 exchange = Exchange(line)
                 count += 1
-                for error in judge.judge(exchange):
+                for error in itertools.chain(judge.judge(exchange), judge.once(exchange)):
                     key = f"{exchange.method} {document.path(exchange.path) or exchange.path} {exchange.status}: {error}"
                     times, example = wrong.get(key, (0, f"{name.rpartition('/')[2]}: {exchange.target}"))
                     wrong[key] = (times + 1, example)
