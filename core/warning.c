@@ -166,8 +166,8 @@ const struct warning_kind warning_kinds[] = {
      "rely "
      "on gray values in it and beside it."},
     {"iterations_held_back", SEVERITY_CAUTION,
-     "Iterations would make the image rougher, by noise or by streaks, as of something dense outside of it: the result "
-     "stays nearer to the plain reconstruction."},
+     "Iterations would make parts of the image rougher, by noise or by streaks, as of something dense in it or beside "
+     "it: those stay nearer to the image that the iterations began with, after its noise reduction."},
     {"noise_beside_metal", SEVERITY_CAUTION,
      "The image is very noisy, as beside a lot of metal: fine detail is smoothed away, and gray values are estimates."},
     {"iterations_settled", SEVERITY_INFO,

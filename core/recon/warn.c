@@ -232,12 +232,15 @@ void warn_restraint(const struct warning_sink *sink, const struct recipe *recipe
 	const double hu = recipe->mu_water / 1000, much = 0.01, most = 2.0 / 3;
 
 	if (report->share < 1 || report->rougher > most)
-		warning_tell(sink, "iterations_held_back",
-			     "in the quietest quarter of the object neighbouring voxels differ by %.3g HU before the "
-			     "iterations and by %.3g HU after them, and %.0f %% of even tissue becomes rougher: kept "
-			     "volumes have %.0f %% of what the iterations changed, and of each even place what "
-			     "leaves it the least rough",
-			     report->rough[0] / hu, report->rough[1] / hu, 100 * report->rougher, 100 * report->share);
+		warning_tell(
+		    sink, "iterations_held_back",
+		    "in the quietest quarter of the object neighbouring voxels differ by %.3g HU in the volume that "
+		    "the iterations begin with, FDK's%s, and by %.3g HU after them, and %.0f %% of even tissue becomes "
+		    "rougher: kept volumes have of each even place as much of the iterations' change as leaves it the "
+		    "least rough, and of edges the same as beside them, or %.0f %% where that is more; the rest is of "
+		    "that first volume",
+		    report->rough[0] / hu, recipe->tv.after_fdk ? " after TV" : "", report->rough[1] / hu,
+		    100 * report->rougher, 100 * report->share);
 	if (report->restored > much)
 		warning_tell(sink, "noise_beside_metal",
 			     "smoothing moved the means of %.3g %% of the object by more than 25 HU beside FDK's: "
