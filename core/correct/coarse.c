@@ -130,6 +130,19 @@ static void average(const float *from, size_t from_step, int pixels, float *ret,
 	}
 }
 
+/* The means over pixels that have one of these are RAY_LEFT_OUT, too. */
+static void leave_out(const struct metal *dense, int view, size_t columns, float *measured)
+{
+	const size_t end = metal_traces_from(dense->traces, dense->traces_count, view + 1);
+
+	for (size_t i = metal_traces_from(dense->traces, dense->traces_count, view); i < end; i++) {
+		const struct metal_trace *trace = &dense->traces[i];
+
+		for (int c = trace->first; c <= trace->last; c++)
+			measured[(size_t)trace->row * columns + (size_t)c] = RAY_LEFT_OUT;
+	}
+}
+
 static int fill(const struct reduced *reduced, const struct coarse_options *options, struct stack *projections,
 		struct stack *ret_stack, struct error *err)
 {
@@ -147,6 +160,7 @@ static int fill(const struct reduced *reduced, const struct coarse_options *opti
 		code = options->backend->stack_download(projections, reduced->views[i], 1, measured, err);
 		if (code < 0)
 			break;
+		leave_out(options->dense, reduced->views[i], columns, measured);
 #pragma omp parallel for schedule(static)
 		for (int r = 0; r < from->rows; r++)
 			average(measured + (size_t)r * columns, 1, from->columns, narrow + (size_t)r * fewer, 1,

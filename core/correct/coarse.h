@@ -2,11 +2,13 @@
 #define CBCT_CORE_COARSE_H
 
 #include "core/backend.h"
+#include "core/correct/metal.h"
 
 /*
  * SART on a coarse grid from a reduced scan: at most COARSE_VIEWS_MOST of its views, spread over the scan, blank ones
  * left out, and their pixels averaged until they are about as wide as the coarse voxels at the isocentre. It finds
- * what the projections say of the object as a whole in a small part of the time of one iteration of the job.
+ * what the projections say of the object as a whole in a small part of the time of one iteration of the job. Pixels in
+ * traces of what is very dense are left out, and with them the wide pixels that hold any.
  */
 enum { COARSE_VIEWS_MOST = 128, COARSE_ITERATIONS = 8, COARSE_SUBSETS_MOST = 10 };
 
@@ -17,8 +19,9 @@ struct coarse_options {
 	const struct orbit *orbit;       /* of that */
 	const int *blank;                /* [blanks], views that were not measured */
 	int blanks;
-	const struct grid *grid; /* the coarse one */
-	struct plan *lender;     /* as of plan_options */
+	const struct grid *grid;   /* the coarse one */
+	struct plan *lender;       /* as of plan_options */
+	const struct metal *dense; /* has those traces */
 	const struct cancel *cancel;
 };
 
@@ -29,7 +32,8 @@ struct coarse_bytes {
 	size_t host;     /* as of outofcore.h */
 };
 
-/* `lender` and `cancel` of the options are not used. Blank views may be unknown: without them SART takes less. */
+/* `lender`, `dense` and `cancel` of the options are not used. Blank views may be unknown: without them SART takes less.
+ */
 int coarse_bytes(const struct coarse_options *options, struct coarse_bytes *ret_bytes, struct error *err);
 
 /* `volume`, on options->grid, is the start and becomes the result; `projections` has a slot for each view. */

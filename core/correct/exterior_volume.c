@@ -178,6 +178,7 @@ static struct coarse_options coarse_options_of(const struct exterior_volume_opti
 	    .blanks = options->blanks,
 	    .grid = grid,
 	    .lender = options->plan,
+	    .dense = options->dense,
 	    .cancel = options->cancel,
 	};
 }

@@ -19,7 +19,8 @@
  * as the chord of a circle does, which no smooth difference to the projections follows, and its voxels are steps there:
  * SART put 20 to 35 HU of that into the grid (tests/bench/results/truncation.txt).
  *
- * exterior_volume_fit makes that agree with the projections, by SART (core/correct/coarse.h). A ray near the end of the
+ * exterior_volume_fit makes that agree with the projections, by SART (core/correct/coarse.h), but for the rays through
+ * what is very dense: coarse voxels do not hold that, and what fills its traces is a guess. A ray near the end of the
  * grid is in it for a short part of its length, to which SART ascribes all of the ray's error: a hundredth of the
  * integral is hundreds of HU there. Slices of a trunk of +-250 mm that end inside of a panel of +-84 mm, worst error of
  * their means: 500 to 1300 HU with that start set to zero where not all views see it, 30 to 340 with SART from there,

@@ -544,13 +544,19 @@ int metal_fdk(const struct metal_tools *tools, struct volume *to, struct error *
 
 /* ---- the prior ---- */
 
-/* HU below which a voxel is air. */
-static const double AIR_HU = -500;
 /*
- * HU of bone in the prior: a voxel keeps nothing of its value as bone up to the first, all from the second on, and
- * between them a growing part. Streaks of the first volume reach higher than those of the later ones.
+ * HU of what is made even in the prior. A voxel keeps nothing of its value up to the first and all of it from the
+ * second on, and between them a growing part; the other way round for soft tissue, from where on what is lighter is
+ * water. Streaks of the first volume reach higher than those of the later ones. What is filled before the model of the
+ * exterior is fitted keeps foam, wood and lung, too: a board between two rails of metal lies in both of their traces,
+ * and air or water in its place is in every ray that passes it outside of the grid.
  */
-static const double BONE_FIRST[2] = {400, 400}, BONE_LATER[2] = {150, 300};
+struct levels {
+	double air[2], soft[2], bone[2];
+};
+static const struct levels FIRST = {{-500, -500}, {-500, -500}, {400, 400}};
+static const struct levels LATER = {{-500, -500}, {-500, -500}, {150, 300}};
+static const struct levels FILLING = {{-850, -700}, {-300, -150}, {400, 400}};
 enum { PASSES = 4 };
 
 /* (1 2 1)/4 along x and along y, outer values held. */
@@ -574,26 +580,28 @@ static void smooth_slice(const struct grid *grid, const float *from, float *scra
 	}
 }
 
-static void classify(const struct grid *grid, double mu_water, const double bone[2], const float *before,
+/* From one value to another while hu goes from the first level to the second. */
+static double between(const double level[2], double hu, double from, double to)
+{
+	if (hu <= level[0])
+		return from;
+	return hu >= level[1] ? to : from + (hu - level[0]) / (level[1] - level[0]) * (to - from);
+}
+
+static void classify(const struct grid *grid, double mu_water, const struct levels *levels, const float *before,
 		     const float *here, const float *behind, float *ret)
 {
 	for (size_t i = 0; i < metal_slice_voxels(grid); i++) {
 		const double value = .25 * ((double)before[i] + 2 * (double)here[i] + (double)behind[i]);
 		const double hu = 1000 * (value / mu_water - 1);
+		const double light = between(levels->air, hu, 0, value);
 
-		if (hu < AIR_HU)
-			ret[i] = 0;
-		else if (hu <= bone[0])
-			ret[i] = (float)mu_water;
-		else if (hu >= bone[1])
-			ret[i] = (float)value;
-		else
-			ret[i] = (float)(mu_water + (hu - bone[0]) / (bone[1] - bone[0]) * (value - mu_water));
+		ret[i] = (float)between(levels->bone, hu, between(levels->soft, hu, light, mu_water), value);
 	}
 }
 
 /* The volume to work in becomes the prior, but for the metal. */
-static int make_prior(const struct metal_tools *tools, const double bone[2], struct error *err)
+static int make_prior(const struct metal_tools *tools, const struct levels *levels, struct error *err)
 {
 	const struct grid *grid = tools->grid;
 	const size_t slice = metal_slice_voxels(grid);
@@ -613,8 +621,8 @@ static int make_prior(const struct metal_tools *tools, const double bone[2], str
 		if (code == 0 && z >= 0) {
 			const float *here = ring + (size_t)(z % 3) * slice;
 
-			classify(grid, tools->mu_water, bone, z > 0 ? ring + (size_t)((z - 1) % 3) * slice : here, here,
-				 z + 1 < nz ? ring + (size_t)((z + 1) % 3) * slice : here, raw);
+			classify(grid, tools->mu_water, levels, z > 0 ? ring + (size_t)((z - 1) % 3) * slice : here,
+				 here, z + 1 < nz ? ring + (size_t)((z + 1) % 3) * slice : here, raw);
 			code = tools->backend->volume_put(tools->volume, z, 1, raw, err);
 		}
 		if (code == 0)
@@ -634,7 +642,7 @@ static float set(struct metal *metal, size_t i, float there, double value)
 
 int metal_fill(struct metal *metal, struct metal *without, const struct metal_tools *tools, struct error *err)
 {
-	int code = make_prior(tools, BONE_FIRST, err);
+	int code = make_prior(tools, &FILLING, err);
 
 	if (code == 0)
 		code = change_slices(without, tools, tools->volume, set, 0, err);
@@ -662,7 +670,7 @@ int metal_replace(struct metal *metal, const struct metal_tools *tools, struct e
 	for (int pass = 0; pass < PASSES && code == 0; pass++) {
 		code = metal_fdk(tools, tools->volume, err);
 		if (code == 0)
-			code = make_prior(tools, pass == 0 ? BONE_FIRST : BONE_LATER, err);
+			code = make_prior(tools, pass == 0 ? &FIRST : &LATER, err);
 		if (code == 0)
 			code = change_slices(metal, tools, tools->volume, at_least_in_core, tools->mu_water, err);
 		if (code == 0)

@@ -84,6 +84,8 @@ int metal_find_traces(struct metal *metal, const struct metal_tools *tools, stru
 /* Replaces them in the projections. After metal_find_traces. */
 int metal_replace(struct metal *metal, const struct metal_tools *tools, struct error *err);
 
+/* First of the traces, in order, of this view or a later one. */
+size_t metal_traces_from(const struct metal_trace *traces, size_t count, int view);
 /* Adds the traces of another list. */
 int metal_add_traces(struct metal *metal, const struct metal *other, struct error *err);
 /* Traces that leave too little to the detector's edge to begin a line from go up to it. True if any does. */

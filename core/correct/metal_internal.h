@@ -19,8 +19,6 @@ enum { METAL_FLANK = 2 };
 
 /* For qsort: by view, row, column. */
 int metal_compare_traces(const void *left, const void *right);
-/* First of the traces, in order, of this view or a later one. */
-size_t metal_traces_from(const struct metal_trace *traces, size_t count, int view);
 
 /* The neighbourhood of a voxel: an ellipsoid, in voxels along the axes. */
 struct metal_rim {
