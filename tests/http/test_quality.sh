@@ -140,5 +140,26 @@ test_what_the_projections_do_not_measure_is_told() {
 	END
 }
 
+# Views from one side, a single voxel, and a grid where nothing is: told in plain words, each once.
+test_what_can_be_no_image_is_told() {
+	local ball=(--phantom ball --scale 40 --density 0.0192 --columns 40 --rows 32 --pixel 5)
+	ends_with() { # CODE SEVERITY NAME JOB: told by the scan or by its job
+		reconstruct "$work/$3" "{\"scan\": \"SCAN\", \"sart\": {\"iterations\": 2}, $4}"
+		req GET "/v1/jobs/$job"
+		json .warnings >"$work/of-job"
+		req GET "/v1/scans/$scan"
+		json .warnings | jq -e -s --arg code "$1" --arg severity "$2" \
+			'add | [.[] | select(.code == $code)] | length == 1 and .[0].severity == $severity and (.[0].summary | length > 20)' - "$work/of-job" >/dev/null ||
+			fail "$1 ($2) of $3: $(json '[.warnings[].code] | join(" ")'), $(jq -r '[.[].code] | join(" ")' "$work/of-job")"
+	}
+	cbct simulate "${ball[@]}" --views 2 --arc 90 -o "$work/two" >/dev/null
+	cbct simulate "${ball[@]}" --views 2 --arc 360 -o "$work/opposite" >/dev/null
+	cbct simulate "${ball[@]}" --views 30 -o "$work/thirty" >/dev/null
+	ends_with few_views serious two '"grid": {"size": [20, 20, 20], "spacing_mm": [4, 4, 4]}'
+	ends_with few_views serious opposite '"grid": {"size": [20, 20, 20], "spacing_mm": [4, 4, 4]}'
+	ends_with grid_too_small caution thirty '"grid": {"size": [1, 1, 1], "spacing_mm": [9, 9, 9]}'
+	ends_with residual_high serious thirty '"fdk": {}, "grid": {"size": [20, 20, 20], "spacing_mm": [1, 1, 1], "origin_mm": [60, 60, -10]}'
+}
+
 start_daemon || exit 1
 run_tests
