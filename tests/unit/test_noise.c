@@ -226,6 +226,7 @@ static const struct anatomy_spec anatomies[] = {
     {HEAD, .9, 2.5, {62, 76, 12}, 1.5, 60, 360, 3e4, 11},
     {HEAD_AND_NECK, .8, 1.6, {66, 62, 12}, 1.1, 80, 360, 5e3, 12},
     {WRIST, .9, .8, {74, 54, 12}, .7, 60, 200, 1e4, 13},
+    {ABDOMEN, .4, 2, {70, 50, 12}, 1.2, 60, 360, 1e6, 161},
 };
 
 enum { THIRD, TENTH };
