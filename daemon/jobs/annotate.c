@@ -30,9 +30,14 @@ static int none(char **ret_text, size_t *ret_length, struct error *err)
 
 int job_annotations(struct job *job, char **ret_text, size_t *ret_length, struct error *err)
 {
+	struct job_record record;
 	int code = store_annotations_read(job->jobs->store, job->id, ret_text, ret_length, err);
 
-	return code == ERR_NOT_FOUND ? none(ret_text, ret_length, err) : code;
+	if (code != ERR_NOT_FOUND)
+		return code;
+	job_record(job, &record);
+	return record.annotated ? error_set(err, ERR_DAMAGED, "the annotations of job %s are gone", job->id)
+				: none(ret_text, ret_length, err);
 }
 
 static int tell(struct job *job, const char *text, size_t length, struct error *err)
@@ -49,6 +54,11 @@ static int tell(struct job *job, const char *text, size_t length, struct error *
 		return code;
 	code = store_annotations_write(job->jobs->store, job->id, text, length, &event, err);
 	free(event.data);
+	if (code == 0) {
+		pthread_mutex_lock(&job->jobs->lock);
+		job->record.annotated = true;
+		pthread_mutex_unlock(&job->jobs->lock);
+	}
 	return code;
 }
 

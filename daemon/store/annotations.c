@@ -1,6 +1,7 @@
 /*
  * STATE/jobs/ID/annotations.json: a document that clients keep with a job. Its first line has the checksum of what
- * follows; the file is replaced whole, synced, and goes with the job's directory. The catalogue knows nothing of it.
+ * follows; the file is replaced whole, synced, and goes with the job's directory. Of it the catalogue knows, behind
+ * that, that there is one: a file that is gone is a loss then.
  */
 #include <stdio.h>
 #include <stdlib.h>
@@ -73,5 +74,5 @@ int store_annotations_write(struct store *store, const char *id, const char *tex
 	else
 		code = durable_commit(&durable, err);
 	store_distrust(store, err);
-	return code == 0 ? store_job_add_event(store, id, event, err) : code;
+	return code == 0 ? store_job_annotated(store, id, event, err) : code;
 }

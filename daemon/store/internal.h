@@ -91,6 +91,9 @@ int store_begin_unsynced(struct store *store, struct error *err);
 /* Commits when code is 0, else rolls back. Returns code, or why the commit failed. */
 int store_end(struct store *store, int code, struct error *err);
 
+/* The job has annotations, behind their file (store/annotations.c). */
+int store_job_annotated(struct store *store, const char *id, const struct event *event, struct error *err);
+
 /* In a group, before the row goes: the deletion is on the disk, and what it names does not come back. */
 int store_note_deletion(struct store *store, int kind, const char *id, struct error *err);
 

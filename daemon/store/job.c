@@ -320,11 +320,17 @@ int store_job_put_sendings(struct store *store, const char *id, const struct sen
 	return end_with_record(store, id, true, code, err);
 }
 
-int store_job_add_event(struct store *store, const char *id, const struct event *event, struct error *err)
+int store_job_annotated(struct store *store, const char *id, const struct event *event, struct error *err)
 {
+	const struct job_record job = {.annotated = true};
 	int code = store_begin(store, err);
 
-	return code != 0 ? code : store_end(store, add_event(store, id, event, err), err);
+	if (code != 0)
+		return code;
+	code = catalogue_set(store->catalogue, id, &job, &job.annotated, err);
+	if (code == 0)
+		code = add_event(store, id, event, err);
+	return end_with_record(store, id, true, code, err);
 }
 
 /* ---- reading ---- */

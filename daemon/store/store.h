@@ -414,7 +414,8 @@ struct job_record {
 	char *subject; /* subject_json and "source" of its scan as text, or NULL, owned; constant after creation */
 	uint8_t digest[32];
 	bool cancel_asked;
-	bool pinned;  /* it stays whatever its age */
+	bool pinned;    /* it stays whatever its age */
+	bool annotated; /* annotations.json was written once, and belongs there since */
 	int attempts; /* 1 with the first run, one more each time that a run was lost; going on after a yield is none */
 	int crashes;  /* workers that died with it */
 	int checkpoint; /* iteration that checkpoint.f32 holds, 0: none */
@@ -580,10 +581,9 @@ int store_jobs_unsent(struct store *store, void (*visit)(void *context, const ch
 enum { STORE_ANNOTATIONS_MAX = 8 << 20 }; /* bytes */
 int store_annotations_read(const struct store *store, const char *id, char **ret_text, size_t *ret_length,
 			   struct error *err);
-/* Replaces it, synced, then adds the event. One call at a time for a job. */
+/* Replaces it, synced, then adds the event, and `annotated` in the job's row. One call at a time for a job. */
 int store_annotations_write(struct store *store, const char *id, const char *text, size_t length,
 			    const struct event *event, struct error *err);
-int store_job_add_event(struct store *store, const char *id, const struct event *event, struct error *err);
 
 /* Reads all jobs, oldest first; free the array with job_records_free. */
 int store_job_load(struct store *store, struct job_record **ret_jobs, int *ret_count, struct error *err);

@@ -66,6 +66,7 @@ static const struct column job_columns[] = {
     {"request_sha256", COLUMN_BYTES, AT(job_record, digest), .nullable = true},
     {"cancel_asked", COLUMN_BOOL, AT(job_record, cancel_asked), .changes = true},
     {"pinned", COLUMN_BOOL, AT(job_record, pinned), .initial = "0", .changes = true},
+    {"annotated", COLUMN_BOOL, AT(job_record, annotated), .initial = "0", .assigned = true},
     {"attempts", COLUMN_INT, AT(job_record, attempts), .changes = true},
     {"crashes", COLUMN_INT, AT(job_record, crashes), .changes = true},
     {"checkpoint", COLUMN_INT, AT(job_record, checkpoint), .changes = true},

@@ -13,7 +13,7 @@
  *   11        of jobs, `memory` and `seconds` were arrays of the processor's numbers; they are numbers with names now
  *   12 .. 22  tables and columns were added
  */
-enum { CATALOGUE_VERSION = 23 };
+enum { CATALOGUE_VERSION = 24 };
 
 /* Brings an empty catalogue (version 0) or an older one to CATALOGUE_VERSION, in one transaction. */
 int catalogue_upgrade(const struct catalogue_backend *backend, void *database, int version, struct error *err);

@@ -106,6 +106,8 @@ test_they_outlive_a_kill_and_the_catalogue() {
 	req GET "$path"
 	expect_status 200
 	same "$whole"
+	req GET "/v1/jobs/$job/events"
+	grep -q '^event: annotations' "$body" || fail "that they were changed, after the catalogue was made again"
 }
 
 test_damage_is_told_and_can_be_mended() {
@@ -115,6 +117,19 @@ test_damage_is_told_and_can_be_mended() {
 	req GET "$path"
 	expect_problem 500
 	expect_json '.type == "urn:cbctd:problem:damaged"'
+	put "$whole" '*'
+	expect_status 200
+	req GET "$path"
+	same "$whole"
+	# one that is gone is not as if there had never been one, also for the next daemon
+	rm "$file"
+	for _ in 1 2; do
+		req GET "$path"
+		expect_problem 500
+		expect_json '.type == "urn:cbctd:problem:damaged" and (.detail | contains("are gone"))'
+		stop_daemon
+		start_daemon
+	done
 	put "$whole" '*'
 	expect_status 200
 	req GET "$path"
