@@ -82,8 +82,19 @@ static int insert(struct calibrations *calibrations, const struct entry *entry, 
 
 /* ---- files ---- */
 
-int calibration_read(struct calibrations *calibrations, const char *id, cJSON **ret_request, cJSON **ret_result,
-		     struct error *err)
+/* Its files go behind its entry when it is deleted, so that one that is listed has them. */
+static bool is_listed(struct calibrations *calibrations, const char *id)
+{
+	bool listed;
+
+	pthread_mutex_lock(&calibrations->lock);
+	listed = calibration_entry(calibrations, id) != NULL;
+	pthread_mutex_unlock(&calibrations->lock);
+	return listed;
+}
+
+int calibration_read(struct calibrations *calibrations, const char *id, bool succeeded, cJSON **ret_request,
+		     cJSON **ret_result, struct error *err)
 {
 	cJSON *request = NULL, *result = NULL;
 	char path[1024];
@@ -91,11 +102,16 @@ int calibration_read(struct calibrations *calibrations, const char *id, cJSON **
 
 	calibration_path(calibrations, id, CALIBRATION_REQUEST, path);
 	code = sealed_read(path, &request, err);
-	if (code != 0)
-		return code;
-	calibration_path(calibrations, id, CALIBRATION_RESULT, path);
-	code = sealed_read(path, &result, err);
-	if (code != 0 && code != ERR_NOT_FOUND) {
+	if (code == 0) {
+		calibration_path(calibrations, id, CALIBRATION_RESULT, path);
+		code = sealed_read(path, &result, err);
+		if (code == ERR_NOT_FOUND && !succeeded)
+			code = 0;
+	}
+	if (code == ERR_NOT_FOUND && is_listed(calibrations, id))
+		code = error_set(err, ERR_DAMAGED, "calibration %s is damaged: its %s is gone", id,
+				 request == NULL ? CALIBRATION_REQUEST : CALIBRATION_RESULT);
+	if (code != 0) {
 		cJSON_Delete(request);
 		return code;
 	}
@@ -198,7 +214,7 @@ int calibration_load(struct calibrations *calibrations, const char *id, struct e
 	struct entry entry = {.state = CALIBRATION_QUEUED};
 	const cJSON *scan, *acquired, *client, *ended;
 	struct error failure;
-	int code = calibration_read(calibrations, id, &request, &result, err);
+	int code = calibration_read(calibrations, id, false, &request, &result, err);
 
 	if (code != 0)
 		return code;
@@ -619,6 +635,7 @@ int calibration_document(struct calibrations *calibrations, const char *id, bool
 {
 	cJSON *document = NULL, *request = NULL, *result = NULL;
 	const struct entry *entry;
+	enum calibration_state state = CALIBRATION_QUEUED;
 	bool ended = false;
 	int code = 0;
 
@@ -626,13 +643,14 @@ int calibration_document(struct calibrations *calibrations, const char *id, bool
 	entry = calibration_entry(calibrations, id);
 	if (entry != NULL) {
 		document = copy_brief(entry);
+		state = entry->state;
 		ended = has_ended(entry);
 	}
 	pthread_mutex_unlock(&calibrations->lock);
 	if (entry == NULL)
 		return no_such(id, err);
 	if (!brief) {
-		code = calibration_read(calibrations, id, &request, &result, err);
+		code = calibration_read(calibrations, id, state == CALIBRATION_SUCCEEDED, &request, &result, err);
 		if (code == 0)
 			calibration_add_rest(document, request, ended ? result : NULL);
 		cJSON_Delete(request);

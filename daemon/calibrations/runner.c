@@ -104,7 +104,7 @@ static void settle(struct calibrations *calibrations, const char *id, int code, 
 		loaded.brief = NULL;
 		code = error_set(&failure, ERR_INTERNAL, "the process that made the calibration left no result");
 	}
-	if (code != 0 && calibration_read(calibrations, id, &request, &result, &failure) == 0) {
+	if (code != 0 && calibration_read(calibrations, id, false, &request, &result, &failure) == 0) {
 		loaded.state = CALIBRATION_FAILED;
 		loaded.brief = calibration_brief(id, request, NULL, &failure);
 	}

@@ -30,7 +30,7 @@ static int open_calibrated(struct calibrations *calibrations, const char *id, st
 	if (state != CALIBRATION_SUCCEEDED)
 		return error_set(err, ERR_CONFLICT, "calibration %s has no result: its state is %s", id,
 				 calibration_state_names[state]);
-	code = calibration_read(calibrations, id, &request, &result, err);
+	code = calibration_read(calibrations, id, true, &request, &result, err);
 	if (code == 0)
 		code = calibrated_read(request, result, ret_calibrated, err);
 	cJSON_Delete(request);

@@ -222,6 +222,7 @@ test_a_phantom_that_stood_turned_is_told_in_every_scan() {
 }
 
 test_calibrations_outlive_crashes_and_damage_is_told() {
+	local file
 	printf '#!/bin/sh\n[ "$1" != --calibrate ] || exec sleep 60\nexec "%s" "$@"\n' "$BUILD/cbct-worker" >"$work/slow"
 	chmod +x "$work/slow"
 	start_daemon --worker "$work/slow"
@@ -244,6 +245,18 @@ test_calibrations_outlive_crashes_and_damage_is_told() {
 	start_daemon
 	req GET "/v1/calibrations/$calibration?wait=60"
 	expect_json '.state == "succeeded"'
+	# a file that is gone under the daemon is told as that: not no calibration, nor one without a geometry
+	for file in request result; do
+		mv "$state/calibrations/$calibration/$file.json" "$work/"
+		req GET "/v1/calibrations/$calibration"
+		expect_problem 500
+		expect_json ".type == \"urn:cbctd:problem:damaged\" and (.detail | contains(\"$file.json\"))"
+		scan "{\"kind\": \"calibration\", \"id\": \"$calibration\"}"
+		expect_problem 500 /geometry/id
+		mv "$work/$file.json" "$state/calibrations/$calibration/"
+	done
+	req GET "/v1/calibrations/$calibration"
+	expect_json '.state == "succeeded" and (.geometry.matrices | length) == 24'
 	stop_daemon
 	printf x | dd of="$state/calibrations/$calibration/result.json" bs=1 seek=100 conv=notrunc status=none
 	start_daemon
