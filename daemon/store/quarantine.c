@@ -14,8 +14,15 @@
 #include "proto/clock.h"
 #include "proto/json.h"
 #include "proto/scan_directory.h"
+#include "proto/sums.h"
 
-enum { NOTE_BYTES_MAX = 4096 };
+enum { NOTE_BYTES_MAX = 4096, FIRST_LINE = 21 /* {"crc32":"89abcdef",\n */ };
+
+/* Of a note: the checksum of what is behind it. */
+static void first_line(const char *rest, size_t length, char ret_line[FIRST_LINE + 1])
+{
+	snprintf(ret_line, FIRST_LINE + 1, "{\"crc32\":\"%08x\",\n", (unsigned)checksum(0, rest, length));
+}
 
 static void entry_path(const char *state, const char *name, const char *extension, char ret_path[1200])
 {
@@ -52,19 +59,27 @@ static int write_note(const char *state, const char *name, const char *path, dou
 		      struct error *err)
 {
 	cJSON *document = cJSON_CreateObject();
-	char file[1200], *text;
+	char file[1200], line[FIRST_LINE + 1], *text, *whole = NULL;
+	size_t length = 0;
 	int code;
 
 	cJSON_AddStringToObject(document, "from", path);
 	cJSON_AddNumberToObject(document, "time", floor(now));
 	cJSON_AddStringToObject(document, "why", why);
-	text = json_print(document, NULL);
+	text = json_print(document, &length);
 	cJSON_Delete(document);
-	if (text == NULL)
+	/* The checksum is the first member, in place of the text's own brace. */
+	if (text != NULL) {
+		first_line(text + 1, length - 1, line);
+		if (asprintf(&whole, "%s%s", line, text + 1) < 0)
+			whole = NULL;
+	}
+	free(text);
+	if (whole == NULL)
 		return error_set_errno(err, ENOMEM, "note of %s", path);
 	entry_path(state, name, ".json", file);
-	code = file_write_durable(file, text, strlen(text), err);
-	free(text);
+	code = file_write_durable(file, whole, strlen(whole), err);
+	free(whole);
 	return code;
 }
 
@@ -122,6 +137,21 @@ int quarantine_forget(const char *state, const char *name, struct error *err)
 
 /* ---- reading ---- */
 
+/* The note's own members in ret_document; one of an earlier version has no checksum. */
+static int parse_note(char *text, size_t length, cJSON **ret_document, struct error *err)
+{
+	static const char begins[] = "{\"crc32\":";
+	char line[FIRST_LINE + 1];
+
+	if (length < FIRST_LINE || memcmp(text, begins, sizeof(begins) - 1) != 0)
+		return json_parse(text, length, ret_document, err);
+	first_line(text + FIRST_LINE, length - FIRST_LINE, line);
+	if (memcmp(text, line, FIRST_LINE) != 0)
+		return error_set(err, ERR_DAMAGED, "a note does not fit its checksum");
+	text[FIRST_LINE - 1] = '{';
+	return json_parse(text + FIRST_LINE - 1, length - (FIRST_LINE - 1), ret_document, err);
+}
+
 static void read_note(const char *state, struct quarantined *entry)
 {
 	char path[1200], *text = NULL;
@@ -132,7 +162,7 @@ static void read_note(const char *state, struct quarantined *entry)
 
 	entry_path(state, entry->name, ".json", path);
 	if (file_read(path, NOTE_BYTES_MAX, &text, &length, &err) == 0 &&
-	    json_parse(text, length, &document, &err) == 0) {
+	    parse_note(text, length, &document, &err) == 0) {
 		json_begin(&reader, document, "", &err);
 		json_string(&reader, "from", true, entry->from, sizeof(entry->from));
 		json_number(&reader, "time", true, 0, 1e12, &entry->time);
