@@ -13,6 +13,7 @@
 #include <stdlib.h>
 #include <string.h>
 
+#include "core/correct/scatter.h"
 #include "core/warning.h"
 
 #include "proto/calibration.h"
@@ -595,6 +596,11 @@ static int read_document(struct scan *scan, const struct scan_calibrations *cali
 		code = read_geometry(scan, geometry, err);
 	if (code == 0)
 		code = orbit_analyse(&scan->orbit, &scan->geometry, err);
+	if (code == 0 && scan->scatter.body.amplitude > 0) {
+		code = scatter_body_check(&scan->geometry, err);
+		if (code != 0)
+			snprintf(err->pointer, sizeof(err->pointer), "/projections/scatter");
+	}
 	return code;
 }
 

@@ -96,6 +96,10 @@ static void result_say(const struct lag_fit *fit)
 	    "lag of %.3g %% in all, %.3g %% in the first frame; the correction leaves %.2g of the signal in the frames "
 	    "without a beam (root mean square), %.2g without it\n",
 	    100 * sum, 100 * fit->first, fit->left, fit->without);
+	if (fit->at_limits[0] != '\0')
+		fprintf(stderr,
+			"the fit ended at the limits of what may be: %s; more frames without a beam may tell more\n",
+			fit->at_limits);
 }
 
 static int fit_lag_run(const void *values, struct error *err)

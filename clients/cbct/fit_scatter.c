@@ -31,7 +31,7 @@ static const struct option rows[] = {
 	"cover the beam are no such bodies",
 	1e-3, 1e6, 2),
     ROW("kernels", 0, OPTION_INTEGER, kernels, "N",
-	"their number; more than one follow the objects of the fit more closely, and others less", 1,
+	"their number, 1 by default; more than one follow the objects of the fit more closely, and others less", 1,
 	SCATTER_KERNELS_MOST, 0),
     ROW("output", 'o', OPTION_TEXT, output, "FILE",
 	"the member \"scatter\" of a scan's projections as JSON, - for standard output", 0, 0, 0),
@@ -147,6 +147,14 @@ static struct scatter_beam beam_of(const struct fit_scatter_options *options, co
 				     .centre = {0.5 * (images->columns - 1), 0.5 * (images->rows - 1)}};
 }
 
+/* 0: a body. */
+static int kernels_of(const struct fit_scatter_options *options)
+{
+	if (!isnan(options->distances_mm[0]))
+		return 0;
+	return options->kernels == OPTION_UNSET_INTEGER ? 1 : (int)options->kernels;
+}
+
 static int fit(const struct fit_scatter_options *options, const struct setup *setup, struct scatter_fit *ret_fit,
 	       struct error *err)
 {
@@ -166,7 +174,7 @@ static int fit(const struct fit_scatter_options *options, const struct setup *se
 	}
 	if (code == 0)
 		code = scatter_fit(exposures, count, setup->open->columns, setup->open->rows, &beam,
-				   isnan(options->distances_mm[0]) ? (int)options->kernels : 0, ret_fit, err);
+				   kernels_of(options), ret_fit, err);
 	free(all);
 	free(exposures);
 	return code;
@@ -185,13 +193,25 @@ static int fit_scatter_run(const void *values, struct error *err)
 		return error_set(err, ERR_USAGE, "--pixel-mm is needed");
 	if (!isnan(options->distances_mm[0]) && !(options->distances_mm[0] < options->distances_mm[1]))
 		return error_set(err, ERR_USAGE, "--distances-mm: the objects are expected before the detector");
+	if (!isnan(options->distances_mm[0]) && options->kernels != OPTION_UNSET_INTEGER)
+		return error_set(err, ERR_USAGE,
+				 "--kernels %ld beside --distances-mm, which fits a body in place of kernels: either",
+				 options->kernels);
 	code = setup_open(options, &setup, err);
 	if (code == 0)
 		code = fit(options, &setup, &result, err);
 	if (code == 0) {
 		fprintf(stderr,
-			"%d places; line integrals are off by %.3g (root mean square), %.3g with the scatter left in\n",
+			"scatter known at %d places; line integrals are off by %.3g (root mean square), %.3g with the "
+			"scatter "
+			"left in\n",
 			result.known, result.rms, result.rms_without);
+		if (result.at_limits[0] != '\0')
+			fprintf(
+			    stderr,
+			    "the fit ended at the limits of what may be: %s; other objects, or more stops, may tell "
+			    "more\n",
+			    result.at_limits);
 		code = fit_write(options->output, "scatter", scatter_json(&result.model), err);
 	}
 	setup_close(&setup);
@@ -201,7 +221,7 @@ static int fit_scatter_run(const void *values, struct error *err)
 static const struct fit_scatter_options defaults = {.output = "-",
 						    .pixel_mm = {OPTION_UNSET_NUMBER, OPTION_UNSET_NUMBER},
 						    .distances_mm = {OPTION_UNSET_NUMBER, OPTION_UNSET_NUMBER},
-						    .kernels = 1,
+						    .kernels = OPTION_UNSET_INTEGER,
 						    .images = IMAGE_OPTIONS_DEFAULTS};
 static const struct positional positionals[] = {
     {"OPEN", "a file, folder or list of images of objects: plates and bottles of water of several sizes, for example",

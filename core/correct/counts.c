@@ -46,6 +46,6 @@ void counts_give(const struct linearise *linearise, const void *samples, size_t 
 		if (!isnan(counts[i]))
 			counts[i] += dark;
 		else
-			counts[i] = sample - dark > least ? sample : fminf(sample, dark);
+			counts[i] = sample - dark <= least ? fminf(sample, dark) : sample; /* NaN stays NaN */
 	}
 }

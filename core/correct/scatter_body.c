@@ -37,6 +37,41 @@ struct scatter_field {
 	float outermost; /* most of half */
 };
 
+struct scatter_beam scatter_beam_of(const struct view *view, bool turned)
+{
+	const double *steps[2] = {view->column_step, view->row_step};
+	struct scatter_beam beam;
+	double normal[3], away[3], length;
+
+	vec_cross(view->column_step, view->row_step, normal);
+	for (int i = 0; i < 3; i++)
+		away[i] = view->pixel0[i] - view->source[i];
+	length = copysign(vec_norm(normal), vec_dot(away, normal));
+	beam.detector_mm = vec_dot(away, normal) / length;
+	beam.body_mm = -vec_dot(view->source, normal) / length;
+	for (int axis = 0; axis < 2; axis++) {
+		const double *step = steps[turned ? 1 - axis : axis];
+
+		beam.pixel_mm[axis] = vec_norm(step);
+		beam.centre[axis] = -vec_dot(away, step) / vec_dot(step, step);
+	}
+	return beam;
+}
+
+int scatter_body_check(const struct geometry *geometry, struct error *err)
+{
+	for (int view = 0; view < geometry->count; view++) {
+		const struct scatter_beam beam = scatter_beam_of(&geometry->views[view], false);
+
+		if (!(beam.body_mm > 0 && beam.body_mm < beam.detector_mm))
+			return error_set(err, ERR_IMPOSSIBLE,
+					 "a body that scatters is expected about the origin, between source and "
+					 "detector: in view %d it is %.4g mm from the source, the detector %.4g mm",
+					 view, beam.body_mm, beam.detector_mm);
+	}
+	return 0;
+}
+
 static int line_open(struct line *line, const struct scatter_beam *beam, int axis, int pixels, int cells)
 {
 	const double width = beam->pixel_mm[axis] * pixels / cells;

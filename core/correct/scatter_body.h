@@ -1,7 +1,11 @@
 #ifndef CBCT_CORE_CORRECT_SCATTER_BODY_H
 #define CBCT_CORE_CORRECT_SCATTER_BODY_H
 
+#include <stdbool.h>
+
 #include "core/detector.h"
+#include "core/error.h"
+#include "core/scan/geometry.h"
 
 /*
  * Scattered radiation of a body of water about the isocentre that is as thick along each ray as the primary says.
@@ -25,6 +29,11 @@ struct scatter_beam {
 	double body_mm;     /* source to the middle of the body, along the same */
 	double centre[2];   /* column and row at which the normal through the source meets the detector */
 };
+
+/* As it is in a view, whose columns and rows are exchanged if `turned`. */
+struct scatter_beam scatter_beam_of(const struct view *view, bool turned);
+/* ERR_IMPOSSIBLE where the isocentre does not lie between source and detector in all views. */
+int scatter_body_check(const struct geometry *geometry, struct error *err);
 
 enum { SCATTER_BODY_CELLS = 32 }; /* along a row or a column, at most */
 

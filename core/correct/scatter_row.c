@@ -43,44 +43,13 @@ static bool is_wanted(const struct recipe *recipe, const struct linearise *linea
 	return linearise->scatter != NULL;
 }
 
-/* Source, isocentre and detector as they are in the first view. */
-static struct scatter_beam beam_of(const struct view *view, bool turned)
-{
-	const double *steps[2] = {view->column_step, view->row_step};
-	struct scatter_beam beam;
-	double normal[3], away[3], length;
-
-	vec_cross(view->column_step, view->row_step, normal);
-	for (int i = 0; i < 3; i++)
-		away[i] = view->pixel0[i] - view->source[i];
-	length = copysign(vec_norm(normal), vec_dot(away, normal));
-	beam.detector_mm = vec_dot(away, normal) / length;
-	beam.body_mm = -vec_dot(view->source, normal) / length;
-	for (int axis = 0; axis < 2; axis++) {
-		const double *step = steps[turned ? 1 - axis : axis];
-
-		beam.pixel_mm[axis] = vec_norm(step);
-		beam.centre[axis] = -vec_dot(away, step) / vec_dot(step, step);
-	}
-	return beam;
-}
-
 static int check(const struct linearise *linearise, const struct geometry *geometry, struct error *err)
 {
 	if (linearise->scatter == NULL)
 		return 0;
 	if (linearise->quantity != QUANTITY_INTENSITY)
 		return error_set(err, ERR_INVALID, "scatter cannot be taken off line integrals, but off intensities");
-	if (linearise->scatter->body.amplitude > 0) {
-		const struct scatter_beam beam = beam_of(&geometry->views[0], false);
-
-		if (!(beam.body_mm > 0 && beam.body_mm < beam.detector_mm))
-			return error_set(err, ERR_INVALID,
-					 "a body that scatters is expected about the origin, between source and "
-					 "detector: it is %.4g mm from the source, the detector %.4g mm",
-					 beam.body_mm, beam.detector_mm);
-	}
-	return 0;
+	return linearise->scatter->body.amplitude > 0 ? scatter_body_check(geometry, err) : 0;
 }
 
 static void close_state(void *context)
@@ -117,7 +86,7 @@ static int open_images(const struct input *input, struct state *state, struct er
 static int open_estimate(const struct correction_job *job, struct state *state, struct error *err)
 {
 	const struct input *input = job->input;
-	const struct scatter_beam beam = beam_of(&job->geometry->views[0], input->turned);
+	const struct scatter_beam beam = scatter_beam_of(&job->geometry->views[0], input->turned);
 
 	state->total = malloc(input->pixels * sizeof(*state->total));
 	if (state->total == NULL)

@@ -5,6 +5,9 @@
 
 #include "core/fit/least_squares.h"
 
+/* A polynomial that leaves no less than this share of what a straight line does follows noise, and no hardening. */
+static const double USELESS = 0.99;
+
 struct fit {
 	const struct hardening_point *points;
 	int count, degree;
@@ -46,7 +49,8 @@ static double first_attenuation(const struct hardening_point *points, int count)
 	return a > 0 ? 1 / a : 0;
 }
 
-static double line_rms(const struct hardening_point *points, int count)
+/* Of a straight line through 0 that becomes `attenuation` times the length, as the polynomial does. */
+static double line_rms(const struct hardening_point *points, int count, double attenuation)
 {
 	double both = 0, length2 = 0, sum = 0;
 
@@ -56,7 +60,7 @@ static double line_rms(const struct hardening_point *points, int count)
 	}
 	for (int i = 0; i < count; i++)
 		sum += pow(points[i].p - both / length2 * points[i].length, 2);
-	return sqrt(sum / count);
+	return sqrt(sum / count) * attenuation * length2 / both;
 }
 
 static int check(const struct hardening_point *points, int count, int degree, struct error *err)
@@ -132,7 +136,13 @@ int hardening_fit(const struct hardening_point *points, int count, int degree, d
 	for (int k = 0; k < degree; k++)
 		result.coefficients[k + 1] = x[k] / pow(fit.longest, k + 1);
 	result.attenuation = fit.attenuation;
-	result.rms_without = line_rms(points, count);
+	result.rms_without = line_rms(points, count, fit.attenuation);
+	if (degree > 1 && !(result.rms < USELESS * result.rms_without))
+		return error_set(
+		    err, ERR_IMPOSSIBLE,
+		    "with the best polynomial of degree %d line integrals are off by %.3g (root mean square), "
+		    "by %.3g with a straight line: no hardening is seen in these points",
+		    degree, result.rms, result.rms_without);
 	*ret_fit = result;
 	return 0;
 }

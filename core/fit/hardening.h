@@ -18,12 +18,13 @@ struct hardening_fit {
 	int count;
 	double attenuation; /* 1/mm */
 	double rms;         /* of p' - attenuation length */
-	double rms_without; /* of the best straight line */
+	double rms_without; /* of p', of the best straight line */
 };
 
 /*
  * degree: of the polynomial. attenuation: 1/mm that p' shall have; 0: that of the shortest lengths, where nothing has
- * hardened yet. ERR_IMPOSSIBLE where there are too few lengths, or the polynomial falls within what was measured.
+ * hardened yet. ERR_IMPOSSIBLE where there are too few lengths, the polynomial falls within what was measured, or one
+ * of degree 2 and more leaves no less than a straight line does.
  */
 int hardening_fit(const struct hardening_point *points, int count, int degree, double attenuation,
 		  struct hardening_fit *ret_fit, struct error *err);

@@ -2,13 +2,17 @@
 #include "core/fit/lag.h"
 
 #include <math.h>
+#include <stdbool.h>
+#include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
 
 #include "core/fit/least_squares.h"
 
 enum { DECAYS = 24, SWEEPS = 4000 };
-static const double DECAY_LEAST = 0.3, SHARE_LEAST = 1e-5, OFF_MOST = 0.5;
+static const double DECAY_LEAST = 0.3, SHARE_LEAST = 1e-5, SHARE_MOST = 0.37, OFF_MOST = 0.5;
+/* A model that leaves no less than this share of what there is without one takes noise off, and no lag. */
+static const double USELESS = 0.99;
 
 struct frames {
 	const double *signal;
@@ -82,8 +86,22 @@ static void model_of(const struct frames *frames, const double *x, struct lag_mo
 {
 	*ret = (struct lag_model){.count = frames->terms};
 	for (int n = 0; n < frames->terms; n++) {
-		ret->terms[n].share = exp(fmin(x[2 * n], -1));
+		ret->terms[n].share = exp(fmin(x[2 * n], log(SHARE_MOST)));
 		ret->terms[n].frames = exp(fmin(fmax(x[2 * n + 1], log(DECAY_LEAST)), log(LAG_FRAMES_MOST)));
+	}
+}
+
+static void tell_limits(const struct lag_model *model, char ret[], size_t size)
+{
+	ret[0] = '\0';
+	for (int n = 0; n < model->count; n++) {
+		const struct lag_term *term = &model->terms[n];
+		const bool much = term->share > 0.999 * SHARE_MOST, brief = term->frames < 1.001 * DECAY_LEAST;
+		const size_t length = strlen(ret);
+
+		if (much || brief || term->frames > 0.999 * LAG_FRAMES_MOST)
+			snprintf(ret + length, size - length, "%s%s %.3g of term %d", length > 0 ? ", " : "",
+				 much ? "share" : "frames", much ? term->share : term->frames, n);
 	}
 }
 
@@ -182,7 +200,14 @@ int lag_fit(const double *signal, int count, int on, struct lag_fit *ret_fit, st
 	free(residuals);
 	if (code < 0)
 		return code;
+	if (!(fit.left < USELESS * fit.without))
+		return error_set(
+		    err, ERR_IMPOSSIBLE,
+		    "the best model of lag leaves %.3g of the signal in the frames without the beam (root mean "
+		    "square), there is %.3g without it: what is there is no sum of exponentials",
+		    fit.left, fit.without);
 	model_of(&frames, x, &fit.model);
+	tell_limits(&fit.model, fit.at_limits, sizeof(fit.at_limits));
 	fit.first = signal[on] / frames.level;
 	*ret_fit = fit;
 	return 0;

@@ -16,11 +16,15 @@ struct lag_fit {
 	double first; /* share of the signal in the first frame without the beam */
 	double left;  /* root mean square of what the correction leaves in these frames, as a share of the signal */
 	double without;
+	char at_limits[256]; /* numbers of the model that ended at the limits of what they may be, in words; or empty */
 };
 
 enum { LAG_FIT_ON_LEAST = 5, LAG_FIT_OFF_LEAST = 10 };
 
-/* ERR_IMPOSSIBLE where there are too few frames, the beam did not go off, or there is no lag to be seen. */
+/*
+ * ERR_IMPOSSIBLE where there are too few frames, the beam did not go off, there is no lag to be seen, or none of these
+ * models leaves less of it.
+ */
 int lag_fit(const double *signal, int frames, int on, struct lag_fit *ret_fit, struct error *err);
 
 #endif

@@ -2,6 +2,8 @@
 #include "core/fit/scatter.h"
 
 #include <math.h>
+#include <stddef.h>
+#include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
 
@@ -9,6 +11,8 @@
 
 enum { KERNEL_PARAMETERS = 5, BODY_PARAMETERS = 2, PLACES_LEAST = 30 };
 static const double PRIMARY_LEAST = 1e-4; /* against air */
+/* A model that leaves no less than this share of what there is without one takes noise off, and no scatter. */
+static const double USELESS = 0.99;
 
 /* A cell of an exposure whose scatter is known. */
 struct place {
@@ -24,30 +28,67 @@ struct fit {
 	struct place *places;
 };
 
-/* Both are positive: their logarithms are sought, from about what they are without a grid on. */
+/* What is sought of each number is its logarithm where it must be positive. */
+struct limit {
+	const char *name;
+	size_t offset; /* of a double in struct scatter_kernel or scatter_body */
+	double least, most;
+	bool logarithm;
+};
+static const struct limit body_limits[BODY_PARAMETERS] = {
+    {"amplitude", offsetof(struct scatter_body, amplitude), SCATTER_BODY_LEAST, SCATTER_AMPLITUDE_MOST, true},
+    {"multiple", offsetof(struct scatter_body, multiple), 1e-6, SCATTER_MULTIPLE_MOST, true},
+};
+static const struct limit kernel_limits[KERNEL_PARAMETERS] = {
+    {"amplitude", offsetof(struct scatter_kernel, amplitude), 1e-9, SCATTER_AMPLITUDE_MOST, true},
+    {"exponent", offsetof(struct scatter_kernel, exponent), SCATTER_EXPONENT_LEAST, SCATTER_EXPONENT_MOST, false},
+    {"power", offsetof(struct scatter_kernel, power), 0, SCATTER_POWER_MOST, false},
+    {"width_mm", offsetof(struct scatter_kernel, width_mm), 1, 550, true},
+    {"asymmetry", offsetof(struct scatter_kernel, asymmetry), -SCATTER_ASYMMETRY_MOST, SCATTER_ASYMMETRY_MOST, false},
+};
+/* From about what they are without a grid on. */
 static const double BODY_START[BODY_PARAMETERS] = {0, -1.2};
 
-static void body_of(const double *x, struct scatter_body *ret)
+/* Into the members of a kernel or a body. */
+static void take_numbers(const struct limit *limits, int count, const double *x, void *ret)
 {
-	ret->amplitude = fmin(fmax(exp(x[0]), SCATTER_BODY_LEAST), SCATTER_AMPLITUDE_MOST);
-	ret->multiple = fmin(exp(x[1]), SCATTER_MULTIPLE_MOST);
+	for (int i = 0; i < count; i++) {
+		const double value = limits[i].logarithm ? exp(x[i]) : x[i];
+
+		*(double *)(void *)((char *)ret + limits[i].offset) =
+		    fmin(fmax(value, limits[i].least), limits[i].most);
+	}
 }
 
-/* Amplitudes and widths are positive, powers and exponents within what physics may have. */
 static void model_of(const struct fit *fit, const double *x, struct scatter_model *ret)
 {
 	*ret = (struct scatter_model){.count = fit->kernels};
 	if (fit->kernels == 0)
-		body_of(x, &ret->body);
-	for (int k = 0; k < fit->kernels; k++) {
-		const double *of = x + KERNEL_PARAMETERS * k;
+		take_numbers(body_limits, BODY_PARAMETERS, x, &ret->body);
+	for (int k = 0; k < fit->kernels; k++)
+		take_numbers(kernel_limits, KERNEL_PARAMETERS, x + KERNEL_PARAMETERS * k, &ret->kernels[k]);
+}
 
-		ret->kernels[k].amplitude = exp(fmin(fmax(of[0], -20), 5));
-		ret->kernels[k].exponent = fmin(fmax(of[1], SCATTER_EXPONENT_LEAST), SCATTER_EXPONENT_MOST);
-		ret->kernels[k].power = fmin(fmax(of[2], 0), SCATTER_POWER_MOST);
-		ret->kernels[k].width_mm = exp(fmin(fmax(of[3], 0), 6.3));
-		ret->kernels[k].asymmetry = fmin(fmax(of[4], -SCATTER_ASYMMETRY_MOST), SCATTER_ASYMMETRY_MOST);
+/* Adds those numbers of a kernel or a body that are at their limits. */
+static void add_limits(const struct limit *limits, int count, const void *of, char ret[], size_t size)
+{
+	for (int i = 0; i < count; i++) {
+		const double value = *(const double *)(const void *)((const char *)of + limits[i].offset);
+		const size_t length = strlen(ret);
+
+		if (value <= limits[i].least || value >= limits[i].most)
+			snprintf(ret + length, size - length, "%s%s %.3g", length > 0 ? ", " : "", limits[i].name,
+				 value);
 	}
+}
+
+static void tell_limits(const struct scatter_model *model, char ret[], size_t size)
+{
+	ret[0] = '\0';
+	if (model->count == 0)
+		add_limits(body_limits, BODY_PARAMETERS, &model->body, ret, size);
+	for (int k = 0; k < model->count; k++)
+		add_limits(kernel_limits, KERNEL_PARAMETERS, &model->kernels[k], ret, size);
 }
 
 static void residuals_of(void *context, const double *x, double *ret)
@@ -94,8 +135,10 @@ static int find_places(struct fit *fit, const struct scatter_exposure *exposures
 	}
 	free(known);
 	if (code == 0 && fit->count < PLACES_LEAST)
-		code = error_set(err, ERR_IMPOSSIBLE, "the scatter is known at %d places, %d are needed", fit->count,
-				 PLACES_LEAST);
+		code = error_set(err, ERR_IMPOSSIBLE,
+				 "the scatter is known at %d places, %d are needed: a place is one of %d cells of the "
+				 "detector in which there are pixels behind a beam stop, in one of %d exposures",
+				 fit->count, PLACES_LEAST, fit->cells, fit->exposures);
 	return code;
 }
 
@@ -153,7 +196,15 @@ int scatter_fit(const struct scatter_exposure *exposures, int count, int columns
 		for (int n = 0; n < fit.count; n++)
 			result.rms_without += pow(fit.places[n].scatter / fit.places[n].primary, 2) / fit.count;
 		result.rms_without = sqrt(result.rms_without);
-		*ret_fit = result;
+		tell_limits(&result.model, result.at_limits, sizeof(result.at_limits));
+		if (!(result.rms < USELESS * result.rms_without))
+			code = error_set(
+			    err, ERR_IMPOSSIBLE,
+			    "with the best %s line integrals are off by %.3g (root mean square), %.3g with the "
+			    "scatter left in: the images say nothing of it, or do not belong together",
+			    kernels > 0 ? "kernels" : "body", result.rms, result.rms_without);
+		else
+			*ret_fit = result;
 	}
 	scatter_free(fit.scatter);
 	free(fit.totals);

@@ -20,10 +20,14 @@ struct scatter_fit {
 	struct scatter_model model;
 	double rms; /* of the line integral's error */
 	double rms_without;
-	int known; /* places that were compared */
+	int known;           /* places that were compared: cells in which the scatter of an exposure is known */
+	char at_limits[256]; /* numbers of the model that ended at the limits of what they may be, in words; or empty */
 };
 
-/* ERR_IMPOSSIBLE where too few places are known, or the scatter is not below the total. */
+/*
+ * ERR_IMPOSSIBLE where too few places are known, the scatter is not below the total, or no such model leaves less than
+ * there is without one.
+ */
 int scatter_fit(const struct scatter_exposure *exposures, int count, int columns, int rows,
 		const struct scatter_beam *beam, int kernels, struct scatter_fit *ret_fit, struct error *err);
 

@@ -137,6 +137,20 @@ test_numbers_that_cannot_be_are_refused() {
 	refuse 400 /projections/scatter "line integrals" '{"scatter": {"fraction": 0.3}, "quantity": "line_integral", "air": null}'
 }
 
+# In one view of a body's scan the detector stands before the isocentre: told with the scan, and where.
+test_a_body_that_is_not_before_the_detector_is_refused() {
+	jq '.projections.scatter = {"kind": "body", "amplitude": 1.4, "multiple": 0.3} | .projections.count = 8 | .geometry = {"kind": "views",
+		"views": [range(8) as $k | ($k * 0.7853981634 | cos) as $c | ($k * 0.7853981634 | sin) as $s | (if $k == 3 then 300 else -480 end) as $d
+		| {"source_mm": [620 * $c, 620 * $s, 0], "pixel0_mm": [$d * $c + 118.5 * $s, $d * $s - 118.5 * $c, -94.5],
+		"column_step_mm": [-3 * $s, 3 * $c, 0], "row_step_mm": [0, 0, 3]}]}' "$work/good/scan.json" >"$work/bad.json"
+	req POST /v1/scans -H 'Content-Type: application/json' --data-binary @"$work/bad.json"
+	expect_problem 422 /projections/scatter
+	expect_json '.detail | contains("in view 3 it is")'
+	jq 'del(.projections.scatter)' "$work/bad.json" >"$work/worse.json"
+	req POST /v1/scans -H 'Content-Type: application/json' --data-binary @"$work/worse.json"
+	expect_status 201
+}
+
 test_projections_out_of_the_order_of_time_are_told() {
 	jq '.projections.lag = [{"share": 0.02, "frames": 3}] | .geometry.angles_deg = [range(60) | . * 210 % 360]
 		| del(.geometry.first_angle_deg, .geometry.angle_step_deg)' "$work/good/scan.json" >"$work/bad.json"
@@ -222,8 +236,11 @@ EOF
 	expect_number "$(jq -n "$(density) / $before")" '>' 1.02 "density over that with scatter"
 	cbct fit-scatter "$work/open.raw" "$work/stopped.raw" --stops "$work/stops.raw" "${how[@]}" --distances-mm 1100,620 2>"$work/said" && fail "objects behind the detector"
 	grep -q 'before the detector' "$work/said" || fail "what is said of it: $(cat "$work/said")"
+	cbct fit-scatter "$work/open.raw" "$work/stopped.raw" --stops "$work/stops.raw" "${how[@]}" --distances-mm 620,1100 --kernels 1 2>"$work/said" &&
+		fail "kernels beside a body"
+	grep -q -e '--kernels 1 beside --distances-mm' "$work/said" || fail "what is said of it: $(cat "$work/said")"
 	cbct fit-scatter "$work/open.raw" "$work/stopped.raw" --stops "$work/flat.raw" "${how[@]}" 2>"$work/said" && fail "no stops are accepted"
-	grep -q 'known at 0 places' "$work/said" || fail "what is said of it: $(cat "$work/said")"
+	grep -q 'known at 0 places, 30 are needed: a place is one of 3072 cells' "$work/said" || fail "what is said of it: $(cat "$work/said")"
 	cbct fit-scatter "$work/open.raw" "$work/flat.raw" --stops "$work/stops.raw" "${how[@]}" 2>"$work/said" && fail "other images are accepted"
 	grep -q '6 images of 64 x 48 pixels without beam stops, 1 of' "$work/said" || fail "what is said of it: $(cat "$work/said")"
 }

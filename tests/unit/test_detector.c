@@ -162,6 +162,33 @@ START_TEST(corrected_counts_keep_their_defects)
 }
 END_TEST
 
+/* Of counts that are no number in half of every projection, too, whatever takes scatter or lag off the others. */
+START_TEST(counts_that_are_no_number_are_told_so)
+{
+	const struct recipe recipe = fdk_on(24, 10, 6.4);
+	const struct scatter_model models[] = {
+	    {.fraction = 0.2}, {.count = 1, .kernels = {{.amplitude = 0.1, .power = 1, .width_mm = 100}}}};
+	const struct lag_model *lags[] = {&LAG, NULL, NULL};
+	float *samples = malloc(sizeof(float) * PIXELS * VIEWS);
+	struct outcome got = {.samples = samples};
+	struct scene scene;
+
+	ck_assert_ptr_nonnull(samples);
+	make_scene(&scene);
+	for (int i = 0; i < PIXELS * VIEWS; i++)
+		samples[i] = i % COLUMNS < COLUMNS / 2 ? NAN : (float)(AIR * exp(-(double)scene.projections[i]));
+	got.linearise = (struct linearise){.sample = SAMPLE_FLOAT32, .quantity = QUANTITY_INTENSITY, .air = AIR};
+	got.linearise.lag = lags[_i];
+	got.linearise.scatter = _i > 0 ? &models[_i - 1] : NULL;
+	run(&scene, &recipe, &got);
+	ck_assert_ptr_nonnull(strstr(got.warnings, "(50 %) in 120 projections"));
+	ck_assert_ptr_nonnull(strstr(got.warnings, "0 not above the dark, 0 saturated, 172800 not finite"));
+	outcome_clear(&got);
+	scene_clear(&scene);
+	free(samples);
+}
+END_TEST
+
 START_TEST(lag_wants_views_in_the_order_of_time)
 {
 	const struct recipe recipe = fdk_on(24, 10, 6.4);
@@ -1030,6 +1057,79 @@ START_TEST(hardening_is_fitted_from_steps_of_water)
 }
 END_TEST
 
+/* Points on a straight line, but for noise. */
+START_TEST(a_polynomial_that_is_of_no_use_is_refused)
+{
+	struct hardening_point points[12];
+	struct hardening_fit fit;
+	struct error err;
+
+	for (int i = 0; i < 12; i++)
+		points[i] = (struct hardening_point){20.0 * (i + 1), 0.02 * 20 * (i + 1) + (i % 2 ? 0.003 : -0.003)};
+	ck_assert_int_eq(hardening_fit(points, 12, 2, 0.0192, &fit, &err), ERR_IMPOSSIBLE);
+	ck_assert_ptr_nonnull(strstr(err.text, "no hardening is seen"));
+	ck_assert_int_eq(hardening_fit(points, 12, 1, 0.0192, &fit, &err), 0);
+	ck_assert_double_eq_tol(fit.coefficients[1], 0.96, 1e-3);
+	ck_assert_double_eq_tol(fit.rms, fit.rms_without, 1e-3 * fit.rms);
+}
+END_TEST
+
+/* A signal that swings behind the end of the beam, and one that rises. */
+START_TEST(a_lag_that_is_none_is_told)
+{
+	enum { FRAMES = 100, ON = 40 };
+	double signal[FRAMES];
+	struct lag_fit fit;
+	struct error err;
+
+	for (int k = 0; k < FRAMES; k++)
+		signal[k] = k < ON ? 10000 : 2 + 40 * sin(2.9 * k);
+	ck_assert_int_eq(lag_fit(signal, FRAMES, ON, &fit, &err), ERR_IMPOSSIBLE);
+	ck_assert_ptr_nonnull(strstr(err.text, "no sum of exponentials"));
+	for (int k = 0; k < FRAMES; k++)
+		signal[k] = k < ON ? 10000 : 40 + 0.5 * (k - ON);
+	ck_assert_int_eq(lag_fit(signal, FRAMES, ON, &fit, &err), 0);
+	ck_assert_msg(strstr(fit.at_limits, "of term 0") != NULL, "%s", fit.at_limits);
+}
+END_TEST
+
+/*
+ * Scatter that is the same all over the detector, so that a kernel's width ends at what it may be; and one that is
+ * below 0, so that taking nothing off is best.
+ */
+START_TEST(a_fit_that_ends_at_its_limits_says_so)
+{
+	enum { PLATES = 4 };
+	const double strong = _i == 0 ? 0.2 : -1e-5;
+	float *all = malloc(sizeof(float) * 2 * PLATES * WIDE * HIGH);
+	struct scatter_exposure exposures[PLATES];
+	struct scatter_fit fit;
+	struct error err;
+	int code;
+
+	ck_assert_ptr_nonnull(all);
+	for (int i = 0; i < PLATES; i++) {
+		float *total = all + (size_t)(2 * i) * WIDE * HIGH, *scatter = total + WIDE * HIGH;
+		const double p = 0.5 * (i + 1);
+
+		for (int k = 0; k < WIDE * HIGH; k++) {
+			scatter[k] = (float)(strong * p * exp(-p));
+			total[k] = (float)exp(-p) + scatter[k];
+		}
+		exposures[i] = (struct scatter_exposure){total, scatter};
+	}
+	code = scatter_fit(exposures, PLATES, WIDE, HIGH, &BEAM, _i == 0, &fit, &err);
+	if (_i == 0) {
+		ck_assert_msg(code == 0, "%s", err.text);
+		ck_assert_msg(strstr(fit.at_limits, "width_mm 550") != NULL, "%s", fit.at_limits);
+	} else {
+		ck_assert_int_eq(code, ERR_IMPOSSIBLE);
+		ck_assert_ptr_nonnull(strstr(err.text, "with the scatter left in"));
+	}
+	free(all);
+}
+END_TEST
+
 Suite *detector_suite(void)
 {
 	Suite *suite = suite_create("detector");
@@ -1039,6 +1139,7 @@ Suite *detector_suite(void)
 	tcase_set_timeout(lag, 120);
 	tcase_add_test(lag, lag_of_three_percent_leaves_no_ghost);
 	tcase_add_test(lag, corrected_counts_keep_their_defects);
+	tcase_add_loop_test(lag, counts_that_are_no_number_are_told_so, 0, 3);
 	tcase_add_test(lag, lag_wants_views_in_the_order_of_time);
 	tcase_add_loop_test(lag, lag_bridges_missing_frames, 0, 2);
 	tcase_add_test(lag, lag_is_fitted_from_the_end_of_the_beam);
@@ -1060,6 +1161,10 @@ Suite *detector_suite(void)
 	tcase_add_loop_test(images, images_of_scatter_that_cannot_be_are_told, 0, 5);
 	suite_add_tcase(suite, images);
 	tcase_add_test(fits, hardening_is_fitted_from_steps_of_water);
+	tcase_add_test(fits, a_polynomial_that_is_of_no_use_is_refused);
+	tcase_add_test(fits, a_lag_that_is_none_is_told);
+	tcase_add_loop_test(fits, a_fit_that_ends_at_its_limits_says_so, 0, 2);
+	tcase_set_timeout(fits, 120);
 	suite_add_tcase(suite, fits);
 	return suite;
 }
