@@ -168,28 +168,53 @@ static void take_means(struct scatter_field *field, const float *p)
 		blur(along, width_mm, field->between + i, across->cells, field->blurred + i);
 }
 
-/* The body along each ray, and the places in it with their light. */
-static void fill_body(struct scatter_field *field, const struct scatter_body *body, const float *p)
+/* Half of the body's thickness along each ray. */
+static void fill_halves(struct scatter_field *field, const float *p)
 {
 	const struct line *across = &field->lines[0], *along = &field->lines[1];
-	const double far = field->beam.detector_mm, area = (double)across->width * (double)along->width;
+	const double far = field->beam.detector_mm;
+	const double most = 0.9 * fmin(field->beam.body_mm, far - field->beam.body_mm);
 
-	take_means(field, p);
-	field->count = 0;
 	field->outermost = 0;
 	for (int cell = 0; cell < across->cells * along->cells; cell++) {
 		const double u = (double)(across->first + across->width * (float)(cell % across->cells));
 		const double v = (double)(along->first + along->width * (float)(cell / across->cells));
+
+		field->half[cell] =
+		    (float)fmin(0.5 * (double)p[cell] / WATER * far / sqrt(u * u + v * v + far * far), most);
+		field->outermost = fmaxf(field->outermost, field->half[cell]);
+	}
+}
+
+/*
+ * The middle of a ray's way through the body. Rays diverge: one that passes beside the middle of a round body meets it
+ * nearer to the source. Of an ellipsoid about the isocentre, whatever its axes, it is this to the second order of its
+ * size against the distance from the source.
+ */
+static inline float middle_at(const struct scatter_field *field, float half)
+{
+	const float middle = (float)field->beam.body_mm;
+
+	return middle - (field->outermost * field->outermost - half * half) / middle;
+}
+
+/* The places in the body with their light. */
+static void fill_places(struct scatter_field *field, const struct scatter_body *body, const float *p)
+{
+	const struct line *across = &field->lines[0], *along = &field->lines[1];
+	const double far = field->beam.detector_mm, area = (double)across->width * (double)along->width;
+
+	field->count = 0;
+	for (int cell = 0; cell < across->cells * along->cells; cell++) {
+		const double u = (double)(across->first + across->width * (float)(cell % across->cells));
+		const double v = (double)(along->first + along->width * (float)(cell / across->cells));
 		const double square = u * u + v * v + far * far, line = (double)p[cell];
-		const double half = fmin(0.5 * line / WATER * far / sqrt(square),
-					 0.9 * fmin(field->beam.body_mm, far - field->beam.body_mm));
+		const double half = (double)field->half[cell], middle = (double)middle_at(field, field->half[cell]);
 		const double more = 1 + body->multiple * (double)field->blurred[cell];
 		const double light = body->amplitude * more * area / square * 2 * half / DEPTHS * WATER * 3 / (16 * PI);
 
-		field->half[cell] = (float)half;
-		field->outermost = fmaxf(field->outermost, (float)half);
 		for (int depth = 0; depth < DEPTHS && p[cell] > THIN; depth++) {
-			const double share = (depth + 0.5) / DEPTHS, z = field->beam.body_mm + half * (2 * share - 1);
+			const double share = (depth + 0.5) / DEPTHS, z = middle + half * (2 * share - 1);
 
 			field->places[field->count++] = (struct place){(float)(u * z / far), (float)(v * z / far),
 								       (float)z, (float)(light * exp(-line * share))};
@@ -230,7 +255,7 @@ static inline float way_out(const struct scatter_field *field, const struct plac
 		const float on = step * ((float)k + 0.5f), z = place->z + on, scale = far / z;
 		const float half = half_at(field, (place->x + on * right) * scale, (place->y + on * down) * scale);
 
-		within += held((half - fabsf(z - middle)) * each + 0.5f, 1);
+		within += held((half - fabsf(z - middle_at(field, half))) * each + 0.5f, 1);
 	}
 	return within * step;
 }
@@ -257,7 +282,9 @@ void scatter_field_of(struct scatter_field *field, const struct scatter_body *bo
 {
 	const struct line *across = &field->lines[0], *along = &field->lines[1];
 
-	fill_body(field, body, p);
+	take_means(field, p);
+	fill_halves(field, p);
+	fill_places(field, body, p);
 #pragma omp parallel for schedule(dynamic)
 	for (int node = 0; node < across->nodes * along->nodes; node++)
 		field->nodes[node] = node_of(field, across->at[node % across->nodes], along->at[node / across->nodes]);

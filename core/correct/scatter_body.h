@@ -10,8 +10,10 @@
 /*
  * Scattered radiation of a body of water about the isocentre that is as thick along each ray as the primary says.
  *
- * On the way of each ray through the body, half of it before the isocentre and half of it behind, the light that has
- * come so far is scattered once and leaves the body on a straight way to the detector:
+ * On the way of each ray through the body the light that has come so far is scattered once and leaves the body on a
+ * straight way to the detector. Of that way half h is before its middle and half behind. The middle is the isocentre
+ * where the body is thickest, H before and behind it, and beside that nearer to the source by (H^2 - h^2) over the
+ * distance from the source to the isocentre, as it is in an ellipsoid:
  *
  *   S(m) = sum over rays m' sum along the ray of A (1 + b q(m')) exp(-in) mu ds w(angle) exp(-out) / light in air at m
  *

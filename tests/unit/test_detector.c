@@ -575,6 +575,112 @@ START_TEST(a_body_holds_for_larger_ones_and_other_distances)
 }
 END_TEST
 
+/* Semi-axes, along the beam and across it, of cylinders of water as high as the beam. */
+static const struct {
+	double along, across;
+} cylinders[] = {{55, 55}, {80, 80}, {100, 130}, {130, 100}};
+
+/* The way through a cylinder from a place onwards: beginning and end, from there, of the line towards a direction. */
+static bool within_cylinder(int c, const double from[3], const double to[3], double ret[2])
+{
+	const double weight[2] = {1 / pow(cylinders[c].along, 2), 1 / pow(cylinders[c].across, 2)};
+	double square = 0, both = 0, rest = -1;
+
+	for (int i = 0; i < 2; i++) {
+		square += weight[i] * to[i] * to[i];
+		both += weight[i] * from[i] * to[i];
+		rest += weight[i] * from[i] * from[i];
+	}
+	if (both * both < square * rest)
+		return false;
+	for (int i = 0; i < 2; i++)
+		ret[i] = (-both + (i == 0 ? -1 : 1) * sqrt(both * both - square * rest)) / square;
+	return true;
+}
+
+/*
+ * Light that electrons at rest (Thomson) scatter once, summed over the body in cubes; the source on the x axis. At a
+ * pixel so many mm aside of the detector's middle, against air there.
+ */
+static double scattered_once(int c, const struct scatter_beam *beam, const double field[2], double aside)
+{
+	enum { CUBE = 5 };
+	const double pixel[3] = {beam->body_mm - beam->detector_mm, aside, 0}, source[3] = {beam->body_mm, 0, 0};
+	const double ray = hypot(beam->detector_mm, aside);
+	double sum = 0;
+
+	for (double x = CUBE / 2.0 - cylinders[c].along; x < cylinders[c].along; x += CUBE)
+		for (double y = CUBE / 2.0 - cylinders[c].across; y < cylinders[c].across; y += CUBE)
+			for (double z = CUBE / 2.0 - field[1]; z < field[1]; z += CUBE) {
+				const double at[3] = {x, y, z}, scale = beam->detector_mm / (beam->body_mm - x);
+				double in[3], out[3], ends[2], far, near, cosine, light;
+
+				if (pow(x / cylinders[c].along, 2) + pow(y / cylinders[c].across, 2) > 1 ||
+				    fabs(y) * scale > field[0] || fabs(z) * scale > field[1])
+					continue;
+				for (int i = 0; i < 3; i++) {
+					in[i] = at[i] - source[i];
+					out[i] = pixel[i] - at[i];
+				}
+				near = vec_norm(in);
+				far = vec_norm(out);
+				for (int i = 0; i < 3; i++) {
+					in[i] /= near;
+					out[i] /= far;
+				}
+				cosine = vec_dot(in, out);
+				ck_assert(within_cylinder(c, at, in, ends));
+				light = exp(WATER * ends[0]) / (near * near);
+				ck_assert(within_cylinder(c, at, out, ends));
+				sum += light * exp(-WATER * ends[1]) * (1 + cosine * cosine) * -out[0] / (far * far);
+			}
+	return sum * pow(CUBE, 3) * WATER * 3 / (16 * M_PI) * pow(ray, 3) / beam->detector_mm;
+}
+
+/*
+ * What a body scatters once is known: the model has it to 3 % behind and beside small and large ones, deep and wide
+ * ones. Rays diverge, so that they meet a round body nearer to the source beside its middle than amid it.
+ */
+START_TEST(light_that_is_scattered_once_is_that_of_the_whole_body)
+{
+	enum { CELLS = 32, HIGH_CELLS = 24, FINE = 4 };
+	const double width = 16, field[2] = {CELLS / 2 * width, HIGH_CELLS / 2 * width};
+	const struct scatter_beam beam = {{width, width}, 1100, 620, {(CELLS - 1) / 2.0, (HIGH_CELLS - 1) / 2.0}};
+	const int cells[2] = {CELLS, HIGH_CELLS};
+	const struct scatter_body body = {.amplitude = 1};
+	const double source[3] = {beam.body_mm, 0, 0};
+	struct scatter_field *model = scatter_field_new(&beam, cells, cells);
+	float p[CELLS * HIGH_CELLS], got[CELLS * HIGH_CELLS];
+
+	ck_assert_ptr_nonnull(model);
+	for (int cell = 0; cell < CELLS * HIGH_CELLS; cell++) {
+		double mean = 0;
+
+		for (int i = 0; i < FINE * FINE; i++) {
+			const double u = (cell % CELLS + (i % FINE + 0.5) / FINE) * width - field[0];
+			const double v =
+			    ((double)(cell / CELLS) + ((double)(i / FINE) + 0.5) / FINE) * width - field[1];
+			const double ray = sqrt(u * u + v * v + beam.detector_mm * beam.detector_mm);
+			const double to[3] = {-beam.detector_mm / ray, u / ray, v / ray};
+			double ends[2];
+
+			mean += within_cylinder(_i, source, to, ends) ? exp(-WATER * (ends[1] - ends[0])) : 1;
+		}
+		p[cell] = (float)-log(mean / (FINE * FINE));
+	}
+	scatter_field_of(model, &body, p, got);
+	for (int column = CELLS / 2; column < CELLS; column += 3) {
+		const double aside = (column + 0.5) * width - field[0];
+		const double wanted = scattered_once(_i, &beam, field, aside);
+		const double found = (double)got[HIGH_CELLS / 2 * CELLS + column];
+
+		printf("%.0f mm aside: %.5f of air, %.5f by the model\n", aside, wanted, found);
+		ck_assert_double_lt(fabs(found / wanted - 1), 0.03);
+	}
+	scatter_field_free(model);
+}
+END_TEST
+
 /* ---- images of scatter ---- */
 
 enum { COARSE = 4, EVERY = 10, IMAGES_MOST = TURNS };
@@ -1134,7 +1240,7 @@ Suite *detector_suite(void)
 {
 	Suite *suite = suite_create("detector");
 	TCase *lag = tcase_create("lag"), *scatter = tcase_create("scatter"), *fits = tcase_create("fits");
-	TCase *images = tcase_create("images");
+	TCase *images = tcase_create("images"), *once = tcase_create("scattered once");
 
 	tcase_set_timeout(lag, 120);
 	tcase_add_test(lag, lag_of_three_percent_leaves_no_ghost);
@@ -1151,6 +1257,9 @@ Suite *detector_suite(void)
 	tcase_add_loop_test(scatter, scatter_is_taken_off_objects_that_its_model_was_not_fitted_on, 0, 2);
 	tcase_add_loop_test(scatter, a_body_holds_for_larger_ones_and_other_distances, 0, 2);
 	suite_add_tcase(suite, scatter);
+	tcase_set_timeout(once, 120);
+	tcase_add_loop_test(once, light_that_is_scattered_once_is_that_of_the_whole_body, 0, 4);
+	suite_add_tcase(suite, once);
 	tcase_set_timeout(images, 120);
 	tcase_add_test(images, scatter_is_taken_off_by_coarse_images_of_some_views);
 	tcase_add_loop_test(images, images_of_scatter_are_linear_in_between, 0, 3);
