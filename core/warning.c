@@ -118,6 +118,9 @@ const struct warning_kind warning_kinds[] = {
     {"rings", SEVERITY_INFO, "Some pixels of the detector had changed since it was calibrated, and were corrected."},
     {"geometry_refined", SEVERITY_INFO,
      "The arm did not stand as the scan says; where it stood was found from the projections."},
+    {"geometry_by_reference", SEVERITY_CAUTION,
+     "Where the arm stood was found by the volume of another scan: the image is right only if that is of the same "
+     "object."},
     {"motion_followed", SEVERITY_CAUTION,
      "The object moved during the sweep; its motion was found from the projections."},
     {"not_refined", SEVERITY_INFO, "The geometry was kept as it is: no other one fits the projections better."},

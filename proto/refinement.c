@@ -201,6 +201,21 @@ int refinement_parse(const cJSON *json, struct refinement *ret_refinement, struc
 	return code;
 }
 
+/* What a reference has changed, of which another one with the same outline may have changed as much. */
+static void tell_reference(const struct refined *refined, char *ret_detail, size_t size)
+{
+	const struct refinement *refinement = refined->refinement;
+	const double *common = refinement->path.common;
+
+	snprintf(
+	    ret_detail, size,
+	    "views were moved by %.2g mm and %.2g degrees (root mean square), the world by %.2g mm and %.2g degrees to "
+	    "where the reference has its object, whose detail stands in the views by a factor of %.2f (1: the same "
+	    "object); %d of %d views that were held out agree better. One of the same outline may do so, too",
+	    refined->rms[0], refined->rms[1], vec_norm(common), vec_norm(common + 3) * PATH_TURN_UNIT * 180 / M_PI,
+	    refinement->alike, refinement->better, refinement->held_out);
+}
+
 const char *refined_tell(const struct refined *refined, char *ret_detail, size_t size)
 {
 	const struct refinement *refinement = refined->refinement;
@@ -226,6 +241,10 @@ const char *refined_tell(const struct refined *refined, char *ret_detail, size_t
 			 refinement->held_out);
 		return "not_refined";
 	}
+	if (refinement->alike > 0) {
+		tell_reference(refined, ret_detail, size);
+		return "geometry_by_reference";
+	}
 	snprintf(ret_detail, size,
 		 "%s by %.2g mm and %.2g degrees (root mean square over the views; at most %.2g mm and %.2g degrees); "
 		 "%d of %d views that were held out agree better, what is unexplained of their detail fell by %.0f %%",
@@ -237,6 +256,6 @@ const char *refined_tell(const struct refined *refined, char *ret_detail, size_t
 
 bool refined_told(const char *code)
 {
-	return strcmp(code, "geometry_refined") == 0 || strcmp(code, "motion_followed") == 0 ||
-	       strcmp(code, "not_refined") == 0;
+	return strcmp(code, "geometry_refined") == 0 || strcmp(code, "geometry_by_reference") == 0 ||
+	       strcmp(code, "motion_followed") == 0 || strcmp(code, "not_refined") == 0;
 }

@@ -17,7 +17,7 @@ digest() {
 }
 told() { # CODE: the job tells it once, and no other one of these
 	req GET "/v1/jobs/$job"
-	expect_json "[.warnings[].code | select(IN(\"geometry_refined\", \"motion_followed\", \"not_refined\"))] == [\"$1\"]"
+	expect_json "[.warnings[].code | select(IN(\"geometry_refined\", \"geometry_by_reference\", \"motion_followed\", \"not_refined\"))] == [\"$1\"]"
 }
 
 keep() { # JOB: what it has refined becomes a calibration
@@ -202,7 +202,8 @@ test_few_noisy_views_are_refined_with_the_volume_of_another_job() {
 	post_projections "$work/few"
 	job=$waiting
 	wait_job succeeded
-	told geometry_refined
+	told geometry_by_reference
+	expect_json '.warnings[] | select(.code == "geometry_by_reference") | .severity == "caution" and (.detail | test("the world by [0-9.]+ mm and [0-9.]+ degrees"))'
 	cbct get "$job" final -o "$work/head.nii" >/dev/null || fail "its volume"
 	refined=$(cbct compare --json "$work/head.nii" "$work/head-truth.nii" | jq .rmse)
 	expect_number "$refined" '<' "$(jq -n "$plain * .99")" "the error with the reference, below that without"

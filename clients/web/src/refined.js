@@ -6,7 +6,7 @@ import { h, svg, replace, write, number } from './dom.js'
 import { get, request } from './api.js'
 import { t } from './lang.js'
 
-const told = ['geometry_refined', 'motion_followed', 'not_refined']
+const told = ['geometry_refined', 'geometry_by_reference', 'motion_followed', 'not_refined']
 const panels = [{ key: 'shift_mm', name: 'Shift, mm' }, { key: 'turn_deg', name: 'Turn, degrees' }]
 const width = 340, panel = 118, left = 46, right = 12, top = 24, foot = 22
 

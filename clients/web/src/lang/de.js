@@ -562,6 +562,7 @@ export const strings = {
 	'The device that should have made the image failed: it is made by the processor, which takes longer; the result is the same.': 'Das Gerät, das das Bild machen sollte, fiel aus: Der Prozessor macht es, was länger dauert; das Ergebnis ist dasselbe.',
 	'Bad pixels of the detector were replaced from their neighbours.': 'Defekte Pixel des Detektors wurden aus ihren Nachbarn ersetzt.',
 	'Bad pixels of the detector are too many, or too close together, to be filled in: the image may be wrong there.': 'Defekte Pixel des Detektors sind zu viele oder zu dicht, um ersetzt zu werden: Das Bild kann dort falsch sein.',
+	'Where the arm stood was found by the volume of another scan: the image is right only if that is of the same object.': 'Wo der Bogen stand, wurde mit dem Volumen eines anderen Scans gefunden: Das Bild stimmt nur, wenn dieses dasselbe Objekt zeigt.',
 	'The arm did not stand as the scan says; where it stood was found from the projections.': 'Der Bogen stand nicht, wie der Scan angibt; wo er stand, wurde aus den Projektionen gefunden.',
 	'The object moved during the sweep; its motion was found from the projections.': 'Das Objekt hat sich während der Aufnahme bewegt; seine Bewegung wurde aus den Projektionen gefunden.',
 	'The geometry was kept as it is: no other one fits the projections better.': 'Die Geometrie blieb, wie sie ist: Keine andere passt besser zu den Projektionen.',
