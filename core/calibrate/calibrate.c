@@ -478,7 +478,68 @@ static const struct calibrated_view *typical_refusal(const struct calibration *c
 	return first;
 }
 
-static int check_result(const struct run *run, struct error *err)
+static void turn_about_z(double v[3], double angle)
+{
+	const double x = v[0], y = v[1];
+
+	v[0] = cos(angle) * x - sin(angle) * y;
+	v[1] = sin(angle) * x + cos(angle) * y;
+}
+
+/*
+ * How near a pose comes to a view whose pairs no pose explains: from the nominal one, each ball with the nearest shadow
+ * however far that is. Returns the RMS in pixels over *ret_balls of them; INFINITY where these are too few for a pose.
+ */
+static double nearest_pose(const struct run *run, int view, double turn, struct pair *pairs, int *ret_balls)
+{
+	enum { ROUNDS = 20 };
+	const double *pixel_mm = run->request->pixel_mm;
+	const struct balls *balls = &run->calibration->balls;
+	struct pose pose = run->matches[view].nominal;
+	double rms = INFINITY;
+
+	/* The phantom turned one way is source and detector turned the other way. */
+	turn_about_z(pose.source, -turn);
+	for (int i = 0; i < 3; i++)
+		turn_about_z(pose.axes[i], -turn);
+	for (int i = 0; i < ROUNDS; i++) {
+		const int count = match_pose(&run->matches[view], &pose, pixel_mm, balls, INFINITY, pairs);
+
+		if (count < PAIRS_LEAST)
+			break;
+		*ret_balls = count;
+		rms = pose_fit(&pose, pixel_mm, balls, pairs, count);
+	}
+	return rms;
+}
+
+/*
+ * What is left under the pose that comes nearest with the most balls of any view, in words; "" where no view has the
+ * shadows for one.
+ */
+static void tell_nearest(const struct run *run, double turn, char *text, size_t size)
+{
+	struct pair pairs[BALLS_MOST];
+	double best = INFINITY;
+	int balls = 0;
+
+	for (int k = 0; k < run->calibration->count; k++) {
+		int count = 0;
+		const double rms = nearest_pose(run, k, turn, pairs, &count);
+
+		/* Few balls are always near some shadow. */
+		if (count > balls || (count == balls && rms < best)) {
+			best = rms;
+			balls = count;
+		}
+	}
+	if (isfinite(best))
+		snprintf(text, size, ": the best leaves a residual of %.2f pixels over %d balls", best, balls);
+	else
+		text[0] = '\0';
+}
+
+static int check_result(const struct run *run, double turn, struct error *err)
 {
 	const struct calibration *calibration = run->calibration;
 	const double ratio = calibration->diameter_ratio, scale = calibration->distance_ratio;
@@ -486,11 +547,14 @@ static int check_result(const struct run *run, struct error *err)
 
 	if (calibration->used < USED_LEAST * calibration->count) {
 		const struct calibrated_view *view = typical_refusal(calibration, &residual);
+		char how[128], nearest[80];
 
-		char how[64] = "and no pose could be fitted to any of them";
-
-		if (residual > 0)
+		if (residual > 0) {
 			snprintf(how, sizeof(how), "at a mean residual of %.2f pixels", residual);
+		} else {
+			tell_nearest(run, turn, nearest, sizeof(nearest));
+			snprintf(how, sizeof(how), "and no pose could be fitted to any of them%s", nearest);
+		}
 		return error_set(err, ERR_IMPOSSIBLE, "%d of %d views do not fit this phantom, %s; view %td: %s",
 				 calibration->count - calibration->used, calibration->count, how,
 				 view - calibration->views, view->refused);
@@ -585,7 +649,7 @@ int calibrate(struct calibration *ret_calibration, const struct calibrate_reques
 	if (code == 0)
 		code = summarise(&run, err);
 	if (code == 0)
-		code = check_result(&run, err);
+		code = check_result(&run, turn, err);
 	if (code == 0)
 		code = sweep_fill(&calibration, request->nominal, err);
 	run_close(&run);

@@ -60,6 +60,7 @@ test_what_does_not_fit_is_told_with_numbers() {
 	jq -e '.distance_ratio > 1.08 and .distance_ratio < 1.12' "$work/tenth.out" >/dev/null || fail "the distances' ratio"
 	jq -c '.balls = 10 | .distance_mm = 70' "$work/phantom.json" >"$work/wrong.json"
 	refused '8 of 8 views do not fit this phantom, and no pose could be fitted to any of them' cbct calibrate "$work/balls" "$work/wrong.json"
+	grep -qE ': the best leaves a residual of [1-9][0-9]*\.[0-9]{2} pixels over (1[0-9]|[7-9]) balls; view' "$work/said" || fail "the best residual in: $(cat "$work/said")"
 	jq -c '.bals = 12' "$work/phantom.json" >"$work/misspelt.json"
 	refused 'bals' cbct calibrate "$work/balls" "$work/misspelt.json"
 	jq -nc '{kind: "helix", balls: 40, diameter_mm: 110, pitch_mm: 40, angle_step_deg: 24, ball_mm: 3, large_ball_mm: 5,
