@@ -29,6 +29,22 @@ static void add_number_or_null(cJSON *object, const char *name, double value)
 		cJSON_AddNumberToObject(object, name, value);
 }
 
+/* Adds how well the projections agree with the geometry; null before that is known, and where it cannot be. */
+static void add_agreement(cJSON *document, const struct recon_agreement *agreement)
+{
+	cJSON *object;
+
+	if (agreement->views == 0) {
+		cJSON_AddNullToObject(document, "geometry_agreement");
+		return;
+	}
+	object = cJSON_AddObjectToObject(document, "geometry_agreement");
+	cJSON_AddNumberToObject(object, "mm", agreement->mm);
+	cJSON_AddNumberToObject(object, "sigma_mm", agreement->sigma_mm);
+	cJSON_AddNumberToObject(object, "unexplained", agreement->unexplained);
+	cJSON_AddNumberToObject(object, "views", agreement->views);
+}
+
 /* ---- scans ---- */
 
 static void add_posted(cJSON *document, const struct scan *scan)
@@ -186,7 +202,18 @@ static void add_kept_until(cJSON *document, double until)
 	json_add_time(document, "kept_until", isfinite(until) ? until : 0);
 }
 
-cJSON *scan_document(struct stored_scan *stored, bool brief)
+/* What was understood of the scan itself, and what its jobs have found. */
+static void add_derived(cJSON *document, struct stored_scan *stored, struct jobs *jobs)
+{
+	struct recon_agreement agreement = {0};
+	cJSON *derived = scan_derived(stored_scan_measured(stored));
+
+	jobs_agreement(jobs, stored_scan_id(stored), &agreement);
+	add_agreement(derived, &agreement);
+	json_add(document, "derived", derived);
+}
+
+cJSON *scan_document(struct stored_scan *stored, struct jobs *jobs, bool brief)
 {
 	const struct scan *scan = stored_scan_parsed(stored);
 	cJSON *document = cJSON_CreateObject();
@@ -226,9 +253,8 @@ cJSON *scan_document(struct stored_scan *stored, bool brief)
 		return NULL;
 	}
 	add_digests(document, stored, scan, &facts);
-	scan = stored_scan_measured(stored);
-	json_add(document, "derived", scan_derived(scan));
-	add_scan_warnings(document, scan, &facts);
+	add_derived(document, stored, jobs);
+	add_scan_warnings(document, stored_scan_measured(stored), &facts);
 	return document;
 }
 
@@ -279,22 +305,6 @@ static void add_denoising(cJSON *document, const struct job_record *record)
 	object = cJSON_AddObjectToObject(document, "denoising");
 	cJSON_AddNumberToObject(object, "noise_hu", record->noise_hu);
 	add_number_or_null(object, "alpha", record->tv_alpha > 0 ? record->tv_alpha : -1);
-}
-
-/* Adds how well the projections agree with the geometry; null before that is known, and where it cannot be. */
-static void add_agreement(cJSON *document, const struct recon_agreement *agreement)
-{
-	cJSON *object;
-
-	if (agreement->views == 0) {
-		cJSON_AddNullToObject(document, "geometry_agreement");
-		return;
-	}
-	object = cJSON_AddObjectToObject(document, "geometry_agreement");
-	cJSON_AddNumberToObject(object, "mm", agreement->mm);
-	cJSON_AddNumberToObject(object, "sigma_mm", agreement->sigma_mm);
-	cJSON_AddNumberToObject(object, "unexplained", agreement->unexplained);
-	cJSON_AddNumberToObject(object, "views", agreement->views);
 }
 
 /* Where what was refined stands; null where the job is not to refine anything. */

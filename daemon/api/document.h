@@ -12,7 +12,7 @@
  */
 
 /* brief: for lists, without geometry, derived, received and missing. Memory only. */
-cJSON *scan_document(struct stored_scan *scan, bool brief);
+cJSON *scan_document(struct stored_scan *scan, struct jobs *jobs, bool brief);
 /* The job with its request; brief: without history and warnings. NULL: *err says what the catalogue has against it. */
 cJSON *job_document(struct job *job, bool brief, struct error *err);
 /* index, state, backend, device, driver, memory, job, restarts. */

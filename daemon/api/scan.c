@@ -58,7 +58,7 @@ int scan_post(void *context, struct request *request, struct error *err)
 		code = post(api, request, &key, &stored, err);
 	if (code != 0)
 		return code;
-	code = request_reply_json(request, 201, scan_document(stored, false), err);
+	code = request_reply_json(request, 201, scan_document(stored, api->jobs, false), err);
 	if (code == 0) {
 		request_reply_header(request, "Location", "/v1/scans/%s", stored_scan_id(stored));
 		request_made(request, stored_scan_id(stored));
@@ -113,7 +113,7 @@ int scan_list(void *context, struct request *request, struct error *err)
 	document = cJSON_CreateObject();
 	list = cJSON_AddArrayToObject(document, "scans");
 	for (int i = 0; i < count; i++)
-		json_append(list, scan_document(scans[i], true));
+		json_append(list, scan_document(scans[i], api->jobs, true));
 	if (more && count > 0)
 		cJSON_AddStringToObject(document, "next", stored_scan_id(scans[count - 1]));
 	else
@@ -131,7 +131,7 @@ int scan_get(void *context, struct request *request, struct error *err)
 
 	if (store_scan_find(api->store, request_argument(request, 0), &scan, err) != 0)
 		return err->code;
-	code = request_reply_json(request, 200, scan_document(scan, false), err);
+	code = request_reply_json(request, 200, scan_document(scan, api->jobs, false), err);
 	stored_scan_release(scan);
 	return code;
 }
@@ -146,7 +146,7 @@ int scan_complete(void *context, struct request *request, struct error *err)
 		return err->code;
 	code = store_scan_close(api->store, scan, err);
 	if (code == 0)
-		code = request_reply_json(request, 200, scan_document(scan, false), err);
+		code = request_reply_json(request, 200, scan_document(scan, api->jobs, false), err);
 	stored_scan_release(scan);
 	return code;
 }

@@ -85,6 +85,8 @@ double job_kept_until(struct job *job);
 bool jobs_pin_scan(struct jobs *jobs, const char *scan);
 /* A pinned job stays whatever its age. ERR_NOT_FOUND: it is removed. */
 int job_pin(struct job *job, bool pinned, struct error *err);
+/* How well its projections agree with its geometry, by the newest job that has found it; false: none has. */
+bool jobs_agreement(struct jobs *jobs, const char *scan, struct recon_agreement *ret_agreement);
 /* Deletes a scan with its files. ERR_CONFLICT, naming the job, while one that has not ended uses the scan. */
 int jobs_delete_scan(struct jobs *jobs, struct stored_scan *scan, struct error *err);
 /* Removes an image of a scan. ERR_CONFLICT, naming the job, while one that runs uses the scan. */

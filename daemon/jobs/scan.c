@@ -1,4 +1,4 @@
-/* Scans that go, or lose an image, while jobs may need them: job.h. */
+/* Scans that go, or lose an image, while jobs may need them; what jobs have found of them: job.h. */
 #include <string.h>
 
 #include "daemon/jobs/internal.h"
@@ -30,6 +30,22 @@ static bool runs(const struct job_record *record)
 static bool has_begun(const struct job_record *record)
 {
 	return runs(record) || (record->state == JOB_QUEUED && record->attempts > 0);
+}
+
+bool jobs_agreement(struct jobs *jobs, const char *scan, struct recon_agreement *ret_agreement)
+{
+	bool found = false;
+
+	pthread_mutex_lock(&jobs->lock);
+	for (int i = jobs->count - 1; i >= 0 && !found; i--) {
+		const struct job *job = jobs->all[i];
+
+		found = job->record.agreement.views > 0 && strcmp(job->scan, scan) == 0;
+		if (found)
+			*ret_agreement = job->record.agreement;
+	}
+	pthread_mutex_unlock(&jobs->lock);
+	return found;
 }
 
 int jobs_delete_scan(struct jobs *jobs, struct stored_scan *scan, struct error *err)

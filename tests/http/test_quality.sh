@@ -38,6 +38,8 @@ test_a_job_tells_whether_the_geometry_fits() {
 		fi
 		post_scan "$work/$name"
 		post_projections "$work/$name"
+		req GET "/v1/scans/$scan"
+		expect_json '.derived | has("geometry_agreement") and .geometry_agreement == null'
 		post_job '{"scan": "SCAN", "grid": {"size": [24, 24, 16], "spacing_mm": [6, 6, 6]}, "fdk": {}}'
 		wait_job succeeded
 		expect_json ".geometry_agreement | .views == 64 and .sigma_mm > 0 and (.mm < 0.1) == $fits"
@@ -49,7 +51,23 @@ test_a_job_tells_whether_the_geometry_fits() {
 		fi
 		expect_json "[.warnings[] | select(.code == \"geometry_wrong\" and .severity == \"serious\")] | (length == 0) == $fits"
 		expect_json '.warnings | all(.code != "geometry_doubtful")'
+		json .geometry_agreement >"$work/$name.agreement"
+		req GET "/v1/scans/$scan"
+		expect_json ".derived.geometry_agreement == $(cat "$work/$name.agreement")"
 	done
+	# The scan says it as long as a job is there that has found it, which one that is cancelled may not have.
+	post_job '{"scan": "SCAN", "grid": {"size": [24, 24, 16], "spacing_mm": [6, 6, 6]}, "fdk": {}}'
+	req DELETE "/v1/jobs/$job"
+	stop_daemon
+	port=${url##*:} start_daemon
+	req GET "/v1/scans/$scan"
+	expect_json ".derived.geometry_agreement == $(cat "$work/aside.agreement")"
+	req GET "/v1/jobs?scan=$scan"
+	for job in $(json '.jobs[].id'); do
+		req DELETE "/v1/jobs/$job"
+	done
+	req GET "/v1/scans/$scan"
+	expect_json '.derived.geometry_agreement == null'
 }
 
 # The same projections, said to be those of an arm that turned the other way: on part of a circle, too.
