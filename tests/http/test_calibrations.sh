@@ -74,6 +74,15 @@ test_a_sagging_arm_is_calibrated_and_its_scans_use_it() {
 		expect_status 201
 		expect_json '[.warnings[].code] | index("calibration_other_sweep") | not'
 	done
+	# a detector of larger pixels, whose middle is in the same place
+	req POST /v1/scans "${json[@]}" "{\"detector\": {\"columns\": 150, \"rows\": 120, \"pixel_mm\": [2.54, 2.54]},
+		\"projections\": {\"count\": 24, \"sample\": \"float32\", \"quantity\": \"line_integral\"}, \"geometry\": {\"kind\": \"calibration\", \"id\": \"$calibration\"}}"
+	expect_status 201
+	expect_warning calibration_other_detector
+	expect_json 'any(.warnings[]; .code == "calibration_other_detector" and (.detail | test("300 x 240 pixels of 1.27 x 1.27 mm, the scan of one of 150 x 120 of 2.54 x 2.54 mm")))'
+	jq -e --slurpfile found "$work/matrices" '[.geometry.matrices, $found[0]] | transpose | all((.[0] | . as $m | map(. / $m[11])) as $a | (.[1] | . as $m | map(. / $m[11])) as $b |
+		[range(4) | ($a[.] - ($b[.] - 149.5 * $b[8 + .]) / 2 - 74.5 * $b[8 + .], $a[4 + .] - ($b[4 + .] - 119.5 * $b[8 + .]) / 2 - 59.5 * $b[8 + .],
+		$a[8 + .] - $b[8 + .]) | fabs] | max < 1e-6)' "$body" >/dev/null || fail "the same middle in larger pixels"
 	scan '{"kind": "calibration", "id": "00000000000000000"}'
 	expect_status 404
 	expect_json '.pointer == "/geometry/id"'
@@ -81,7 +90,10 @@ test_a_sagging_arm_is_calibrated_and_its_scans_use_it() {
 	# a picture, while the phantom's scan is there
 	req GET "/v1/calibrations/$calibration/views/3"
 	expect_status 200
-	[ "$(head -c 4 "$body" | od -An -tx1 | tr -d ' \n')" = 89504e47 ] || fail "a PNG"
+	cp "$body" "$work/view.png"
+	cbct simulate -o "$work/true" --phantom ball --scale 2 "${arm[@]}" --views 24 --kind matrices
+	/usr/bin/python3 "$here/circles.py" "$work/view.png" "$work/phantom.json" "$work/true/scan.json" 3 || fail "circles where the balls are"
+	! /usr/bin/python3 "$here/circles.py" "$work/view.png" "$work/phantom.json" "$work/true/scan.json" 4 2>/dev/null || fail "circles of this view alone"
 	req GET "/v1/calibrations/$calibration/views/24"
 	expect_status 404
 	req DELETE "/v1/scans/$balls"
@@ -98,6 +110,19 @@ test_a_sagging_arm_is_calibrated_and_its_scans_use_it() {
 	req GET "/v1/calibrations/$calibration"
 	expect_json '.state == "succeeded"'
 	jq -c .geometry.matrices "$body" | cmp - "$work/matrices" || fail "the same matrices"
+
+	# two days later it is too old where a day is allowed, and not where half a year is
+	local own="{\"kind\": \"calibration\", \"id\": \"$calibration\"}" allowed
+	scan "$own"
+	expect_json '[.warnings[].code] | index("calibration_old") | not'
+	for allowed in 1 180; do
+		stop_daemon
+		LD_PRELOAD="$BUILD/clock.so" CBCT_TEST_CLOCK=$((2 * 86400 + 3600)) start_daemon --calibration-age $allowed
+		scan "$own"
+		expect_status 201
+		[ $allowed = 180 ] || expect_json 'any(.warnings[]; .code == "calibration_old" and .severity == "caution" and (.detail | test("2 days old when this scan began, 1 are allowed")))'
+		[ $allowed = 1 ] || expect_json '[.warnings[].code] | index("calibration_old") | not'
+	done
 	req DELETE "/v1/calibrations/$calibration"
 	expect_status 204
 	req GET "/v1/calibrations/$calibration"
@@ -292,7 +317,7 @@ test_cbct_and_python_calibrate() {
 		        client.calibrate(balls, {"kind": "circles", "balls": 10, "diameter_mm": 90, "distance_mm": 70, "ball_mm": 6})
 		        raise SystemExit("another phantom was taken")
 		    except cbctd.CalibrationFailed as error:
-		        assert "do not fit" in str(error), error
+		        assert "do not fit" in str(error) and "leaves a residual of" in str(error), error
 	END
 	cbct rm "$calibration"
 	[ -z "$(cbct calibrations | grep "$calibration")" ] || fail "a calibration that was removed"
