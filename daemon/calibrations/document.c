@@ -143,6 +143,7 @@ cJSON *calibration_brief(const char *id, const cJSON *request, const cJSON *resu
 	static const char *const figures[] = {"used",           "residual_pixels", "residual_isocentre_mm",
 					      "turned_deg",     "other_turn_deg",  "diameter_ratio",
 					      "distance_ratio", "balls_moved_mm"};
+	const cJSON *balls = cJSON_GetObjectItemCaseSensitive(result, "balls_mm");
 	cJSON *document = cJSON_CreateObject();
 	char href[64];
 
@@ -163,6 +164,10 @@ cJSON *calibration_brief(const char *id, const cJSON *request, const cJSON *resu
 	add_error(document, failure);
 	for (size_t i = 0; i < sizeof(figures) / sizeof(figures[0]); i++)
 		add_copy(document, figures[i], result);
+	if (cJSON_IsArray(balls))
+		cJSON_AddNumberToObject(document, "balls", cJSON_GetArraySize(balls));
+	else
+		cJSON_AddNullToObject(document, "balls");
 	add_warnings(document, failure->code == 0 ? result : NULL);
 	return document;
 }

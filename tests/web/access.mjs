@@ -3,7 +3,7 @@ import { origin, launch, software, open, realComplaints, shoot, until, expect, t
 import { readFileSync } from 'node:fs'
 import { join } from 'node:path'
 
-const { SCAN: scan, FINISHED: finished, VIEW, ACQUIRE, ADMIN } = process.env
+const { SCAN: scan, FINISHED: finished, CALIBRATION: calibration, VIEW, ACQUIRE, ADMIN } = process.env
 const browser = await launch(software)
 
 async function signIn(page, token) {
@@ -19,7 +19,7 @@ test('the page asks for a token, and a wrong one gets nothing', async () => {
 	await signIn(page, `${VIEW}x`)
 	await until('a refusal', () => page.textContent('.signin .trouble'), text => text === 'No valid token.')
 	expect((await page.context().cookies()).length === 0, 'no cookie')
-	expect(await page.locator('.head').count() === 0, 'nothing of the job')
+	expect(await page.locator('.head').count() === 0 && await page.locator('.places:visible').count() === 0, 'nothing of the job, and no way on')
 	await page.context().close()
 })
 
@@ -52,6 +52,10 @@ test('who may view sees volumes, events and downloads, and is offered nothing mo
 	await until('what was set aside', () => page.textContent('.status'), text => text.includes('1 set aside in quarantine'))
 	expect(/^jobs\/1m7yam2f9rgevqe7: ./.test(await page.locator('.devices.bad', { hasText: 'quarantine' }).getAttribute('title')), 'which, and why')
 	expect(await page.locator('.acquires:visible').count() === 0, 'no button in the lists')
+	await page.click('.places a:has-text("Calibrations")')
+	await page.click(`.calibrations a[href="#/calibrations/${calibration}"]`)
+	await page.waitForSelector('.calibration .badge.succeeded')
+	expect(await page.locator('.acquires').count() > 0 && await page.locator('.acquires:visible').count() === 0, 'no button of a calibration')
 	await page.context().close()
 })
 

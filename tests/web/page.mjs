@@ -7,7 +7,8 @@ import {
 	realComplaints, shoot, until, expect, test, runTests,
 } from './lib.mjs'
 
-const { SCAN: scan, FINISHED: finished, NAME: name, SOURCES: sources } = process.env
+const { SCAN: scan, FINISHED: finished, NAME: name, SOURCES: sources, BALLS: ballScan, CALIBRATION: calibration, SAGGING: sagging } = process.env
+const phantom = JSON.parse(process.env.PHANTOM)
 const axe = readFileSync(createRequire(import.meta.url).resolve('axe-core/axe.min.js'), 'utf8')
 
 const browser = await launch(software)
@@ -707,6 +708,109 @@ test('what was refined is drawn over the projections, stands in a table, and is 
 	await page.context().close()
 })
 
+/* ---- calibrations ---- */
+
+async function calibrated(arm, drawing = phantom) {
+	const { id } = await post('/v1/calibrations', { scan: ballScan, arm, phantom: drawing })
+	return api(`/v1/calibrations/${id}?wait=60`)
+}
+const short = value => String(Number(value.toPrecision(2)))
+
+test('a calibration comes into the list, tells its residuals projection by projection, and goes after a question', async () => {
+	const page = await open(browser, '/')
+	await page.click('.places a:has-text("Calibrations")')
+	await page.waitForSelector(`.calibrations li[data-id="${calibration}"] .badge.succeeded`)
+	const made = await calibrated('arm <b>3</b>'), row = `.calibrations li[data-id="${made.id}"]`, refused = made.views.flatMap((view, k) => view.used ? [] : [k])
+	await page.waitForSelector(`${row} .badge.succeeded`)
+	expect(refused.length > 0 && made.views[5].shadows === 0 && refused.includes(5), `the empty picture refused: ${refused}`)
+	const told = await page.textContent(row)
+	for (const words of ['arm <b>3</b>', `Residual ${short(made.residual_pixels)} pixels, ${short(made.residual_isocentre_mm)} mm at the isocentre`, '24 balls', `${refused.length} projections refused`,
+		'16 projections, 360°, counter-clockwise', '240 × 192 pixels of 1.58 × 1.58 mm', ' old', made.views[refused[0]].refused])
+		expect(told.includes(words), `"${words}" in: ${told}`)
+	await shoot(page, 'calibrations')
+
+	await page.click(`${row} a`)
+	const shown = view => page.waitForSelector(`.calibration canvas[data-view="${view}"]`)
+	await shown(0)
+	expect(await page.textContent('h1') === 'arm <b>3</b>', 'the name as a text')
+	expect(await page.locator('.calibration .screen.upward').count() === 1, 'the picture the right way up')
+	const slider = page.locator('.calibration input[type=range]'), label = () => page.textContent('.calibration output')
+	await slider.focus()
+	await page.keyboard.press('ArrowRight')
+	await shown(1)
+	const { balls: seen, residual_pixels: pixels } = made.views[1]
+	expect((await label()).startsWith(`Projection 1: ${seen} of 24 balls, residual ${short(pixels)} pixels`), `its numbers: ${await label()}`)
+	const drawn = await page.$eval('.calibration canvas', canvas => [canvas.width, canvas.height, ...canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height).data.filter((_, i) => i % 4 === 0)])
+	const png = await picture(`/v1/calibrations/${made.id}/views/1`)
+	expect(drawn[0] === png.width && drawn[1] === png.height && png.pixels.every((value, i) => Math.abs(value - drawn[i + 2]) <= 1), 'the daemon\'s picture, pixel by pixel')
+	await page.keyboard.press('End')
+	await shown(15)
+	await page.click('.refused button:has-text("Projection 5")')
+	await shown(5)
+	expect(await label() === `Projection 5 is refused: ${made.views[5].refused}`, `why: ${await label()}`)
+
+	for (const [member, panel, line] of [['residual_pixels', 'residual_pixels', 0], ['largest_residual_pixels', 'residual_pixels', 1], ['residual_isocentre_mm', 'residual_isocentre_mm', 0], ['balls', 'balls', 0]]) {
+		const points = (await page.getAttribute(`.plot.residuals .${panel} .line.axis-${line}`, 'd')).split(/[ML]/).slice(1).map(point => point.split(',').map(Number))
+		const values = made.views.filter(view => view.used).map(view => view[member])
+		expect(points.length === values.length && correlation(values, points.map(point => -point[1])) > 0.999, `${member}: heights as the numbers`)
+	}
+	expect(await page.locator('.plot.residuals .balls .marked').count() === refused.length, 'a mark for each that is refused')
+	const box = await page.locator('.plot.residuals').boundingBox()
+	await page.locator('.plot.residuals').click({ position: { x: box.width * (46 + 7 / 15 * 282) / 340, y: box.height / 3 } })
+	await shown(7)
+	await page.click('.calibration summary:has-text("As a table")')
+	await until('the same as a table', () => page.locator('.calibration tbody tr').count(), count => count === 16)
+	expect((await page.textContent('.use')).includes(`"geometry": {"kind": "calibration", "id": "${made.id}"}`), 'how it is used')
+	await shoot(page, 'calibration', { fullPage: true })
+
+	await page.click('button:has-text("Remove …")')
+	await page.click('dialog button:has-text("Keep it")')
+	await page.click('button:has-text("Remove …")')
+	await page.click('dialog button.danger')
+	await page.waitForSelector(`.calibrations li[data-id="${calibration}"]`)
+	expect(await page.locator(row).count() === 0 && (await fetch(`${origin}/v1/calibrations/${made.id}`)).status === 404, 'it is gone')
+	await page.context().close()
+})
+
+test('a calibration that is being made says so until it has ended, one that fails says why, with its residual', async () => {
+	const page = await open(browser, '/')
+	let making = true
+	await page.route(`**/v1/calibrations/${calibration}`, async route => {
+		const document = await (await route.fetch()).json()
+		const unknown = Object.fromEntries(['ended', 'used', 'residual_pixels', 'residual_isocentre_mm', 'balls', 'balls_mm', 'views', 'geometry'].map(member => [member, null]))
+		await route.fulfill({ json: making ? { ...document, ...unknown, state: 'running', warnings: [] } : document })
+	})
+	await page.goto(`${origin}/#/calibrations/${calibration}`)
+	await until('that it is being made', () => page.textContent('.calibration .title'), text => /running\s+is being made/.test(text))
+	expect(await page.locator('.calibration .film:visible, .plot.residuals:visible').count() === 0, 'no picture yet')
+	making = false
+	await page.waitForSelector('.calibration canvas[data-view="0"]')
+	const failed = await calibrated('left', { ...phantom, balls: 10, distance_mm: 70 })
+	await page.goto(`${origin}/#/calibrations/${failed.id}`)
+	await until('why', () => page.textContent('.calibration .notice.bad'), text => /do not fit this phantom.*a residual of [\d.]+ pixels/.test(text))
+	expect(await page.locator('.calibration .film:visible, .use:visible').count() === 0, 'no picture')
+	await page.goto(`${origin}/#/calibrations`)
+	await until('why, in the list', () => page.textContent(`.calibrations li[data-id="${failed.id}"]`), text => text.includes('do not fit this phantom'))
+	await api(`/v1/calibrations/${failed.id}`, { method: 'DELETE' }).catch(() => {})
+	await page.context().close()
+})
+
+test('a scan leads to its calibration, and says how well its projections agree with its geometry', async () => {
+	const own = await post('/v1/scans', { detector: { columns: 240, rows: 192, pixel_mm: [1.58, 1.58] }, projections: { count: 16, sample: 'float32', quantity: 'line_integral' }, geometry: { kind: 'calibration', id: calibration } })
+	const page = await open(browser, `/#/scans/${own.id}`)
+	await page.click('.scan a:has-text("the calibration")')
+	await page.waitForSelector('.calibration canvas[data-view="0"]')
+	const facts = () => page.textContent('.scan .aside')
+	await page.goto(`${origin}/#/scans/${sagging}`)
+	await until('its geometry', facts, text => text.includes('Given as'))
+	expect(!(await facts()).includes('Geometry fits to'), 'nothing that no job has found')
+	const job = await ended((await post('/v1/jobs', { scan: sagging, grid: { size: [24, 24, 16], spacing_mm: [6, 6, 6] }, fdk: {} })).id)
+	await page.reload()
+	await until('the number in mm', facts, text => text.includes(`Geometry fits to${short(job.geometry_agreement.mm)} mm at the isocentre`))
+	expect(job.geometry_agreement.mm > 0.5, 'an arm that sags')
+	await page.context().close()
+})
+
 test('warnings, parameters, geometry, projections and downloads', async () => {
 	const page = await openFinished()
 	expect(!await page.isVisible('button:has-text("Send to archive")'), 'no button where there is no archive')
@@ -1304,6 +1408,11 @@ test('no barriers, targets for fingers and nothing covered: every page, at every
 			await page.click('dialog .expert summary')
 		}],
 		['the scan', `/#/scans/${scan}`, page => page.waitForSelector('.film canvas[data-projection="0"]')],
+		['the calibrations', '/#/calibrations', page => page.waitForSelector('.calibrations .badge.succeeded')],
+		['the calibration', `/#/calibrations/${calibration}`, async page => {
+			await page.waitForSelector('.calibration canvas[data-view="0"]')
+			await page.click('.calibration summary:has-text("As a table")')
+		}],
 		['the acquisition', `/#/jobs/${acquiring.id}`, page => page.waitForSelector('.acquiring .film canvas[data-projection="0"]')],
 		['the interface', '/#/interface', async page => {
 			await page.waitForSelector('.subject .entry')
@@ -1488,6 +1597,14 @@ test('without JavaScript a text, and pages that need none', async () => {
 	await page.click('nav >> text=iter-1')
 	expect((await page.getAttribute('img >> nth=0', 'src')).includes('/iter-1/'), 'another volume')
 	await shoot(page, 'plain')
+	await page.context().close()
+})
+
+test('of a calibration whose scan is removed the numbers stay, and it is said why there are no pictures', async () => {
+	await fetch(`${origin}/v1/scans/${ballScan}`, { method: 'DELETE' })
+	const page = await open(browser, `/#/calibrations/${calibration}`)
+	await until('why', () => page.textContent('.calibration .film'), text => text.includes('has been deleted: there is no picture of it'))
+	expect(await page.locator('.calibration .screen:visible').count() === 0 && await page.locator('.plot.residuals .line').count() === 4, 'its residuals')
 	await page.context().close()
 })
 

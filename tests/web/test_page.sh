@@ -6,12 +6,22 @@ here=$top/tests/web
 tools=$BUILD/web-tests
 name='knee <b>3</b> & "co"'
 
-# A daemon, a scan of the solid over 220 degrees that does not say how it lies, and a job of it that does and has ended.
+phantom='{"kind": "circles", "balls": 12, "diameter_mm": 110, "distance_mm": 90, "ball_mm": 6, "first_angle_deg": 10, "shift_deg": 15}'
+
+# A daemon, a calibration and the scan of balls that it was made of, one picture of them empty; a scan of an arm that sags,
+# which was not calibrated; a scan of the solid over 220 degrees that does not say how it lies, and a job of it that does and has ended.
 prepare() {
 	node "$here/solid.mjs" "$work/solid.f32"
 	cbct simulate --volume "$work/solid.f32" --size 24,24,24 --spacing 4 --centre --name "$name" --views 56 --arc 220 --columns 64 --rows 64 \
 		--pixel 3.2 --source-to-isocentre 620 --source-to-detector 1100 -o "$work/scan" >/dev/null
+	printf '%s' "$phantom" >"$work/phantom.json"
+	cbct simulate -o "$work/balls" --balls "$work/phantom.json" --density .6 --columns 240 --rows 192 --pixel 1.58 --sag daly --views 16 --photons 20000 >/dev/null
+	dd if=/dev/zero of="$work/balls/projections.raw" bs=$((240 * 192 * 4)) seek=5 count=1 conv=notrunc status=none
+	cbct simulate -o "$work/sagging" --phantom asymmetric --scale 70 --density 0.0192 --views 64 --arc 200 --columns 80 --rows 64 --pixel 4.8 --sag daly >/dev/null
 	start_daemon --threads 1
+	sagging=$(cbct upload "$work/sagging" | head -1)
+	balls=$(cbct upload "$work/balls" | head -1)
+	calibration=$(cbct calibrate-scan "$balls" "$work/phantom.json" --arm "arm in room 2")
 	post_scan "$work/scan"
 	post_projections "$work/scan"
 	post_job '{"scan": "SCAN", "grid": {"size": [36, 32, 40], "spacing_mm": [3, 3.4, 2.8]}, "fdk": {}, "sart": {"iterations": 7}, "tv": {}, "emit": ["fdk", 1, 2, 4, 6], "patient": {"position": "HFS"}}'
@@ -126,15 +136,16 @@ browser_tests() {
 		echo "skip $(basename "$0") the page in a browser: $why" >>"$RESULTS"
 		return
 	fi
-	if ! (set -eEuo pipefail; trap - EXIT; prepare; echo "$url $scan $job" >"$work/prepared") >"$work/prepare.log" 2>&1; then
+	if ! (set -eEuo pipefail; trap - EXIT; prepare; echo "$url $scan $job $balls $calibration $sagging" >"$work/prepared") >"$work/prepare.log" 2>&1; then
 		echo "FAIL the page in a browser: no job to look at"
 		tail -5 "$work/prepare.log"
 		echo "fail $(basename "$0") the page in a browser" >>"$RESULTS"
 		return
 	fi
-	read -r url scan job <"$work/prepared"
+	read -r url scan job balls calibration sagging <"$work/prepared"
 	cp "$here"/*.mjs "$tools/"
-	URL=$url OUT=$work SCAN=$scan FINISHED=$job NAME=$name SOURCES=$top/clients/web/src CHROMIUM=$CHROMIUM HOME=$work timeout -k 20 600 node "$tools/page.mjs" 2>&1 | tee "$work/browser.log"
+	BALLS=$balls CALIBRATION=$calibration SAGGING=$sagging PHANTOM=$phantom \
+		URL=$url OUT=$work SCAN=$scan FINISHED=$job NAME=$name SOURCES=$top/clients/web/src CHROMIUM=$CHROMIUM HOME=$work timeout -k 20 600 node "$tools/page.mjs" 2>&1 | tee "$work/browser.log"
 	status=${PIPESTATUS[0]}
 	# the same job where the daemon asks who it is
 	stop_daemon
@@ -146,7 +157,7 @@ browser_tests() {
 	mkdir "$state/jobs/1m7yam2f9rgevqe7"
 	echo something >"$state/jobs/1m7yam2f9rgevqe7/final.nii"
 	start_daemon --threads 1 --tokens "$work/tokens" --keep 86400 --max-jobs 5 --client-bytes 1G --max-bytes 2G
-	VIEW=$VIEW ACQUIRE=$ACQUIRE ADMIN=$ADMIN URL=$url OUT=$work SCAN=$scan FINISHED=$job CHROMIUM=$CHROMIUM HOME=$work timeout -k 20 300 node "$tools/access.mjs" 2>&1 | tee -a "$work/browser.log"
+	VIEW=$VIEW ACQUIRE=$ACQUIRE ADMIN=$ADMIN CALIBRATION=$calibration URL=$url OUT=$work SCAN=$scan FINISHED=$job CHROMIUM=$CHROMIUM HOME=$work timeout -k 20 300 node "$tools/access.mjs" 2>&1 | tee -a "$work/browser.log"
 	status=$((status + PIPESTATUS[0]))
 	archive_test
 	while read -r line; do

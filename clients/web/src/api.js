@@ -45,11 +45,17 @@ export async function requestTagged(method, path, options) {
 	return { document: await response.json(), tag: response.headers.get('ETag') }
 }
 
+/* A picture, to be drawn. */
+export async function getPicture(path, signal) {
+	return createImageBitmap(await (await ask('GET', path, { headers: { Accept: 'image/png, application/problem+json' }, signal })).blob())
+}
+
 export const get = (path, signal) => request('GET', path, { signal })
 
 export const id = encodeURIComponent
 export const jobPath = job => `/v1/jobs/${id(job)}`
 export const scanPath = scan => `/v1/scans/${id(scan)}`
+export const calibrationPath = calibration => `/v1/calibrations/${id(calibration)}`
 export const volumePath = (job, volume) => `${jobPath(job)}/volumes/${id(volume)}`
 
 /* A key that makes a repeated POST harmless. Without randomUUID, which plain http:// does not have. */

@@ -3,7 +3,7 @@ import { h, number, duration, bytes, timeElement } from './dom.js'
 import { groups, at, stageText, valueText } from './parameters.js'
 import { t, inSentence } from './lang.js'
 
-const list = entries => h('dl', {}, entries.filter(entry => entry && entry[1] !== null && entry[1] !== undefined)
+export const list = entries => h('dl', {}, entries.filter(entry => entry && entry[1] !== null && entry[1] !== undefined)
 	.map(([name, value]) => h('div', {}, h('dt', {}, name), h('dd', {}, value))))
 
 const times = (numbers, digits = 4) => numbers.map(value => number(value, digits)).join(' × ')
@@ -15,13 +15,15 @@ const patientText = patient => patient?.position ? `${patient.position}: ${posit
 /* How long --keep leaves a job or scan; null where nothing is said. */
 const keptText = thing => thing.pinned ? t('pinned: whatever its age') : thing.kept_until ? [t('until '), timeElement(thing.kept_until), t(', unless it is pinned')] : null
 
-/* patient: of a job that says otherwise than its scan. */
-export function geometryFacts(scan, patient = scan.patient) {
+const agreementText = agreement => agreement ? t('{mm} mm at the isocentre (one projection: ± {sigma} mm), {share} % of the detail elsewhere', { mm: number(agreement.mm, 2), sigma: number(agreement.sigma_mm, 2), share: Math.round(100 * agreement.unexplained) }) : null
+
+/* job: of which this is the scan, which may have said otherwise how the patient lies, and has its own word on the geometry. */
+export function geometryFacts(scan, job = null) {
 	const derived = scan.derived ?? {}
 	const { detector, projections } = scan
 	return list([
 		[t('Projections'), t('{n} of {size}', { n: projections.count, size: `${detector.columns} × ${detector.rows}` })],
-		[t('Patient'), patientText(patient)],
+		[t('Patient'), patientText((job ?? scan).patient)],
 		[t('Pixel'), detector.pixel_mm && `${times(detector.pixel_mm)} mm`],
 		[t('at the isocentre'), derived.pixel_at_isocentre_mm && `${times(derived.pixel_at_isocentre_mm, 3)} mm`],
 		[t('Arc'), derived.arc_deg !== undefined && [`${number(derived.arc_deg, 4)}°`, { clockwise: t('clockwise'), 'counter-clockwise': t('counter-clockwise') }[derived.direction], { full: t('a full turn'), short: t('a short scan') }[derived.scan] ?? derived.scan].filter(Boolean).join(', ')],
@@ -31,7 +33,9 @@ export function geometryFacts(scan, patient = scan.patient) {
 		[t('Fan angle'), derived.fan_angle_deg !== undefined && `${number(derived.fan_angle_deg, 3)}°`],
 		[t('Field of view'), derived.field_of_view_mm !== undefined && `${number(derived.field_of_view_mm, 4)} mm`],
 		[t('Detector displaced'), derived.detector_displacement_mm > 0.005 ? `${number(derived.detector_displacement_mm, 3)} mm` : null],
-		[t('Given as'), { circular: t('a circle'), matrices: t('one matrix a view'), views: t('source and detector of each view') }[scan.geometry?.kind]],
+		[t('Geometry fits to'), job ? null : agreementText(derived.geometry_agreement)],
+		[t('Given as'), { circular: t('a circle'), matrices: t('one matrix a view'), views: t('source and detector of each view'),
+			calibration: h('a', { href: `#/calibrations/${encodeURIComponent(scan.geometry?.id)}` }, t('the calibration {id}', { id: scan.geometry?.id })) }[scan.geometry?.kind]],
 		[t('Values'), `${projections.quantity === 'intensity' ? t('counts') : t('line integrals')}, ${projections.sample}`],
 		[t('Received'), timeElement(scan.created)],
 		[t('Kept'), keptText(scan)],
@@ -65,7 +69,7 @@ export function jobFacts(job) {
 		...parameterFacts(job),
 		[t('Noise'), job.denoising ? `${number(job.denoising.noise_hu)} HU` : null],
 		[t('Alpha found'), job.tv?.alpha === 'auto' && job.denoising ? (job.denoising.alpha === null ? t('nothing to smooth') : number(job.denoising.alpha)) : null],
-		[t('Geometry fits to'), job.geometry_agreement ? t('{mm} mm at the isocentre (one projection: ± {sigma} mm), {share} % of the detail elsewhere', { mm: number(job.geometry_agreement.mm, 2), sigma: number(job.geometry_agreement.sigma_mm, 2), share: Math.round(100 * job.geometry_agreement.unexplained) }) : null],
+		[t('Geometry fits to'), agreementText(job.geometry_agreement)],
 		[t('Ended after'), job.stopped ? t('{n} iterations: {why}', { n: job.stopped.iteration, why: stopReasons()[job.stopped.rule] ?? job.stopped.reason }) : null],
 		[t('Runs on'), job.ran_on?.length > 1 ? t('{device} ({backend}), devices {list}', { device: job.device, backend: job.backend, list: job.ran_on.join(', ') }) : job.device ? `${job.device} (${job.backend})` : job.backend],
 		[t('Memory'), job.memory ? bytes(job.memory.total) : null],

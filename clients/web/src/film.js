@@ -14,10 +14,10 @@ function angle(scan, k) {
 }
 
 /* Whether rows run towards superior, so that the picture must be turned over: then it is as seen from the source. */
-function upward({ geometry }) {
+export function upward({ geometry }) {
 	if (geometry?.kind === 'views')
 		return geometry.views[0].row_step_mm[2] > 0
-	if (geometry?.kind !== 'matrices')
+	if (!geometry?.matrices)
 		return true
 	/* How the row changes along z at the isocentre. */
 	const [, , , , , , rowZ, row, , , depthZ, depth] = geometry.matrices[0]

@@ -298,7 +298,7 @@ export class JobPage {
 		this.refined.show(job)
 		replace(this.about, jobFacts(job))
 		if (this.#first)
-			replace(this.geometry, geometryFacts(scan, job.patient))
+			replace(this.geometry, geometryFacts(scan, job))
 		this.#first = false
 		this.#showAcquiring(job)
 		this.film.show(scan)

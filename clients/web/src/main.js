@@ -4,6 +4,7 @@ import { get, request } from './api.js'
 import { ListPage } from './lists.js'
 import { JobPage } from './job.js'
 import { ScanPage } from './scan.js'
+import { CalibrationsPage, CalibrationPage } from './calibrations.js'
 import { ReferencePage } from './reference.js'
 import { keepSession } from './session.js'
 import { themeButton } from './theme.js'
@@ -14,6 +15,8 @@ const devicesTime = 10000 /* ms */
 const routes = [
 	[/^#?\/?$/, tools => new ListPage(tools)],
 	[/^#\/jobs\/([^/]+)$/, (tools, job) => new JobPage(decodeURIComponent(job), tools)],
+	[/^#\/calibrations$/, tools => new CalibrationsPage(tools)],
+	[/^#\/calibrations\/([^/]+)$/, (tools, calibration) => new CalibrationPage(decodeURIComponent(calibration), tools)],
 	[/^#\/interface$/, tools => new ReferencePage(tools)],
 	[/^#\/scans\/([^/]+)$/, (tools, scan) => new ScanPage(decodeURIComponent(scan), tools)],
 ]
@@ -27,6 +30,8 @@ const quarantine = h('span', { class: 'devices bad' })
 const aside = h('div', { class: 'notice bad', role: 'status', hidden: true })
 main.before(aside)
 const status = document.querySelector('.status')
+const places = h('nav', { class: 'places', 'aria-label': t('Lists'), hidden: true }, [['#/', t('Jobs')], ['#/calibrations', t('Calibrations')]].map(([href, text]) => h('a', { href }, text)))
+status.before(places)
 const tongue = h('select', { 'aria-label': t('Language'), class: 'tongue', onchange: event => chooseLanguage(event.target.value) },
 	languages.map(code => h('option', { value: code, selected: code === language() }, code.toUpperCase())))
 status.append(quarantine, devices, live, tongue, themeButton())
@@ -55,6 +60,8 @@ function open() {
 			break
 		}
 	}
+	for (const link of places.children)
+		link.setAttribute('aria-current', link.hash === (location.hash || '#/') ? 'page' : 'false')
 	replace(main, page ? page.element : h('p', { class: 'empty' }, t('There is nothing here. '), h('a', { href: '#/' }, t('All jobs'))))
 	scrollTo(0, 0)
 }
@@ -116,11 +123,13 @@ keepSession({
 	status,
 	open() {
 		known = true
+		places.hidden = false
 		open()
 		showDevices()
 	},
 	close() {
 		known = false
+		places.hidden = true
 		page?.close()
 		page = null
 		tools.live(null)
