@@ -38,9 +38,21 @@ struct search {
 	bool *sure;    /* [count], of those that are out */
 };
 
-/* How far a view's strips are off what lies between those of two others: the squared mean, so that little of a view,
- * as a plate seen from its edge, counts for little. */
-static double between(const struct search *search, int view, int before, int behind, double share)
+/* A side of the detector, an eighth of it. */
+enum side { NO_SIDE, FIRST_COLUMNS, LAST_COLUMNS, FIRST_ROWS, LAST_ROWS, SIDES };
+
+/* True for a sample of a strip along an axis (narrow.h) that lies on this side. */
+static bool is_on(enum side side, int axis, int strip, int sample, int samples)
+{
+	const int across = side == FIRST_ROWS || side == LAST_ROWS;
+	const int at = axis == across ? sample * NARROW_STRIPS / samples : strip;
+
+	return side != NO_SIDE && at == (side == FIRST_COLUMNS || side == FIRST_ROWS ? 0 : NARROW_STRIPS - 1);
+}
+
+/* How far a view's strips, but for one side of the detector, are off what lies between those of two others: the squared
+ * mean, so that little of a view, as a plate seen from its edge, counts for little. */
+static double between(const struct search *search, int view, int before, int behind, double share, enum side without)
 {
 	const struct view_strips *v = &search->strips[view], *a = &search->strips[before], *b = &search->strips[behind];
 	const float part = (float)share;
@@ -53,7 +65,7 @@ static double between(const struct search *search, int view, int before, int beh
 				const float p = a->p[axis][s][i], q = b->p[axis][s][i];
 				const float off = v->p[axis][s][i] - p - part * (q - p);
 
-				if (isnan(off))
+				if (isnan(off) || is_on(without, axis, s, i, search->samples[axis]))
 					continue;
 				sum += (double)fabsf(off);
 				count++;
@@ -63,7 +75,7 @@ static double between(const struct search *search, int view, int before, int beh
 
 static double apart_of(const struct search *search, int a, int b)
 {
-	return between(search, a, b, b, 0);
+	return between(search, a, b, b, 0, NO_SIDE);
 }
 
 /* The share of the second of two views at which a view lies best between them, 0 to 1. */
@@ -411,7 +423,7 @@ static int beside(const struct search *search, int place, int side)
 }
 
 /* How far a view would lie off at a place, as if the views beside it stood next to it; INFINITY: not known. */
-static double off_at(const struct search *search, int view, int place, int before, int behind)
+static double off_at(const struct search *search, int view, int place, int before, int behind, enum side without)
 {
 	const struct ring *ring = search->ring;
 	double from, to;
@@ -420,20 +432,20 @@ static double off_at(const struct search *search, int view, int place, int befor
 		return INFINITY;
 	from = ring_turn(ring, before, place);
 	to = ring_turn(ring, place, behind);
-	return between(search, view, search->views[before], search->views[behind], from / (from + to)) /
+	return between(search, view, search->views[before], search->views[behind], from / (from + to), without) /
 	       fmax(1, pow(from * to / (search->gap * search->gap), 2));
 }
 
 /* At its own place: the least of three, so that one view beside it may be wrong. */
-static double off_of(const struct search *search, int place)
+static double off_of(const struct search *search, int place, enum side without)
 {
 	const int view = search->views[place], before = beside(search, place, -1), behind = beside(search, place, 1);
-	double off = off_at(search, view, place, before, behind);
+	double off = off_at(search, view, place, before, behind, without);
 
 	if (!isfinite(off))
 		return off;
-	off = fmin(off, off_at(search, view, place, beside(search, before, -1), behind));
-	return fmin(off, off_at(search, view, place, before, beside(search, behind, 1)));
+	off = fmin(off, off_at(search, view, place, beside(search, before, -1), behind, without));
+	return fmin(off, off_at(search, view, place, before, beside(search, behind, 1), without));
 }
 
 /* True if the view lies between two others as well as views usually do, whatever stands between those; better: times
@@ -451,7 +463,7 @@ static bool fits_elsewhere(const struct search *search, int place, double off, d
 			if (next == place)
 				break;
 			left = between(search, view, search->views[k], search->views[next],
-				       share_between(search, view, search->views[k], search->views[next]));
+				       share_between(search, view, search->views[k], search->views[next]), NO_SIDE);
 			if (left <= FITS * fmin(search->usual[k], search->usual[next]) && better * left <= off)
 				return true;
 			next = beside(search, next, 1);
@@ -463,10 +475,22 @@ static bool fits_elsewhere(const struct search *search, int place, double off, d
 static void look_at_singles(const struct search *search)
 {
 	for (int i = 0; i < search->ring->count; i++)
-		search->apart[i] =
-		    search->out[i] ? INFINITY
-				   : off_at(search, search->views[i], i, beside(search, i, -1), beside(search, i, 1));
+		search->apart[i] = search->out[i] ? INFINITY
+						  : off_at(search, search->views[i], i, beside(search, i, -1),
+							   beside(search, i, 1), NO_SIDE);
 	make_usual(search, search->apart, search->usual);
+}
+
+/*
+ * True if a view lies off on one side of the detector alone: there something comes in from beyond it, as the end of a
+ * table's board, which is between two views what it is in neither. A view that was taken elsewhere is off all over.
+ */
+static bool is_off_at_a_side(const struct search *search, int place)
+{
+	for (enum side side = FIRST_COLUMNS; side < SIDES; side++)
+		if (!(off_of(search, place, side) > OFF * search->usual[place]))
+			return true;
+	return false;
 }
 
 /* Takes single views out, the worst ones first. */
@@ -489,8 +513,9 @@ static void find_singles(const struct search *search)
 		if (worst < 0)
 			return;
 		known[worst] = true;
-		off = off_of(search, worst);
-		if (!(off > OFF * search->usual[worst]) || !fits_elsewhere(search, worst, off, BETTER))
+		off = off_of(search, worst, NO_SIDE);
+		if (!(off > OFF * search->usual[worst]) || is_off_at_a_side(search, worst) ||
+		    !fits_elsewhere(search, worst, off, BETTER))
 			continue;
 		search->sure[worst] =
 		    off > SURE * OFF * search->usual[worst] && fits_elsewhere(search, worst, off, SURE * BETTER);
@@ -509,8 +534,8 @@ static int from_for(const struct search *search, int place)
 
 	for (int i = 0; i < search->ring->count; i++) {
 		if (!search->out[i] || i == place ||
-		    !(off_at(search, search->views[i], place, beside(search, place, -1), beside(search, place, 1)) <=
-		      FITS * search->usual[place]))
+		    !(off_at(search, search->views[i], place, beside(search, place, -1), beside(search, place, 1),
+			     NO_SIDE) <= FITS * search->usual[place]))
 			continue;
 		if (from >= 0)
 			return -1;

@@ -16,7 +16,7 @@
  * not when it is turned about.
  *
  * A single view that lies far off what the views on both sides let be expected, and that lies between two other ones as
- * well as views usually do, is left out.
+ * well as views usually do, is left out; not one that is off at one side of the detector alone.
  */
 
 /*

@@ -120,6 +120,36 @@ START_TEST(exchanged_views_are_put_in_their_places)
 }
 END_TEST
 
+static const struct {
+	int views;
+	double first; /* degrees */
+} tables[] = {{114, 251}, {102, 153}, {108, 31}, {78, 190}};
+
+/* A view in which the end of a table's board has just left the detector is between its neighbours what neither is. */
+START_TEST(the_end_of_a_board_that_leaves_the_detector_misplaces_no_view)
+{
+	const struct orbit_spec spec = {
+	    64, 24, tables[_i].views, {620, 1100, {4, 4}, {0, 0}, {0, 0}}, tables[_i].first, 360. / tables[_i].views};
+	struct ellipsoid parts[] = {
+	    {.shape = SHAPE_ELLIPSOID, .semi_axes = {33, 30, 28}, .density = 0.0192},
+	    {.shape = SHAPE_BOX, .semi_axes = {150, 2, 200}, .centre = {0, 52, 0}, .density = 0.0115},
+	};
+	const struct phantom phantom = {.count = 2, .parts = parts};
+	const struct grid grid = grid_of(12, 12, 6, 6, 6, 6);
+	struct recipe recipe = recipe_on(&grid);
+	struct outcome outcome = {0};
+	struct scene scene;
+
+	recipe.fdk.on = true;
+	scene_orbit(&scene, &spec);
+	scene_add(&scene, &phantom);
+	run(&scene, &recipe, &outcome);
+	ck_assert_msg(strstr(outcome.warnings, "misplaced_views") == NULL, "%s", outcome.warnings);
+	outcome_clear(&outcome);
+	scene_clear(&scene);
+}
+END_TEST
+
 Suite *misplaced_suite(void)
 {
 	Suite *suite = suite_create("misplaced");
@@ -127,6 +157,8 @@ Suite *misplaced_suite(void)
 
 	tcase_set_timeout(tests, 60);
 	tcase_add_loop_test(tests, exchanged_views_are_put_in_their_places, 0, ROWS_OF_TEST);
+	tcase_add_loop_test(tests, the_end_of_a_board_that_leaves_the_detector_misplaces_no_view, 0,
+			    sizeof(tables) / sizeof(*tables));
 	suite_add_tcase(suite, tests);
 	return suite;
 }
