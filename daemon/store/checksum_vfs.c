@@ -184,22 +184,35 @@ static int file_close(sqlite3_file *file)
 	return base_of(file)->pMethods->xClose(base_of(file));
 }
 
+/*
+ * SQLite takes what a page lacks at the end of the file for zeros: rows that are gone, or others. That is right of the
+ * first page of a file that has none yet alone; pages that were not written to the database are in its log.
+ */
+static bool is_begin_of_none(sqlite3_file *base, sqlite3_int64 offset)
+{
+	sqlite3_int64 size = 0;
+
+	return offset == 0 && base->pMethods->xFileSize(base, &size) == SQLITE_OK && size == 0;
+}
+
 static int file_read_page(sqlite3_file *file, void *to, int size, sqlite3_int64 offset)
 {
 	const struct page_file *paged = (const void *)file;
 	int result = base_of(file)->pMethods->xRead(base_of(file), to, size, offset);
 	bool fits = true;
 
-	if (result != SQLITE_OK)
+	if (result == SQLITE_IOERR_SHORT_READ && paged->kind == KIND_DATABASE && is_page(size, offset))
+		fits = is_begin_of_none(base_of(file), offset);
+	else if (result != SQLITE_OK)
 		return result;
-	if (paged->kind == KIND_DATABASE && is_page(size, offset))
+	else if (paged->kind == KIND_DATABASE && is_page(size, offset))
 		fits = page_fits(to, (uint32_t)(offset / PAGES_BYTES) + 1);
 	else if (paged->kind == KIND_LOG && frame_at(size, offset) >= 0)
 		fits = frame_fits(paged->pages, frame_at(size, offset), to);
 	if (!fits)
 		log_line(LEVEL_ERROR, "the catalogue is damaged: %s at byte %lld",
 			 paged->kind == KIND_LOG ? "its log" : "its file", (long long)offset);
-	return fits ? SQLITE_OK : SQLITE_IOERR_DATA;
+	return fits ? result : SQLITE_IOERR_DATA;
 }
 
 static int file_write_page(sqlite3_file *file, const void *from, int size, sqlite3_int64 offset)

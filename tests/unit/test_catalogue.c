@@ -421,6 +421,57 @@ START_TEST(damage_while_it_is_open_is_found)
 }
 END_TEST
 
+/* What the job's rows and warnings say, if anything; the first warning is that of end_job. */
+static void says_the_same_or_nothing(void)
+{
+	struct warning_record *warnings;
+	struct history_row *rows;
+	struct error err = {0};
+	int count, code = store_job_rows(state.store, job_id, &rows, &count, &err);
+
+	if (code == 0) {
+		ck_assert_int_eq(count, 1);
+		ck_assert(rows[0].residual == 0.1 && rows[0].change == 1. / 3 && rows[0].seconds == 1e-3);
+		free(rows);
+	} else {
+		ck_assert_int_eq(code, ERR_IO);
+	}
+	code = store_job_warnings(state.store, job_id, &warnings, &count, &err);
+	if (code == 0) {
+		ck_assert_str_eq(warnings[0].detail, "no \"dark\" image: \xc3\xa4");
+		free(warnings);
+	} else {
+		ck_assert_int_eq(code, ERR_IO);
+	}
+}
+
+/* The row that a page had first stands at its end: that is cut off, once of each page. */
+START_TEST(a_catalogue_that_is_cut_off_while_it_is_open_says_nothing_else)
+{
+	OF_SQLITE();
+	struct stored_scan *scan;
+	struct error err = {0};
+
+	free(picture()); /* which job it is */
+	state_close(&state);
+	copy_file("catalogue.sqlite", "kept");
+	for (off_t page = 4096; page < size_of("kept"); page += 4096) {
+		copy_file("kept", "catalogue.sqlite");
+		state_reopen(&state);
+		/* A commit, behind which the log has the number of pages, and nothing of the job. */
+		ck_assert_int_eq(store_scan_find(state.store, scan_id, &scan, &err), 0);
+		ck_assert_int_eq(store_scan_pin(state.store, scan, true, &err), 0);
+		stored_scan_release(scan);
+		ck_assert_int_eq(
+		    truncate(state_path(&state, "catalogue.sqlite"), page + PAGES_BYTES - PAGES_RESERVE - 2), 0);
+		says_the_same_or_nothing();
+		state_close(&state);
+	}
+	copy_file("kept", "catalogue.sqlite");
+	state_reopen(&state);
+}
+END_TEST
+
 START_TEST(a_record_that_is_lost_is_written_again)
 {
 	char *before = picture(), name[128];
@@ -579,6 +630,7 @@ Suite *catalogue_suite(void)
 	tcase_add_test(tests, a_damaged_log_takes_nothing);
 	tcase_add_test(tests, an_end_of_the_log_that_was_not_synced_may_be_lost);
 	tcase_add_test(tests, damage_while_it_is_open_is_found);
+	tcase_add_test(tests, a_catalogue_that_is_cut_off_while_it_is_open_says_nothing_else);
 	tcase_add_test(tests, a_record_that_is_lost_is_written_again);
 	tcase_add_test(tests, what_nobody_knows_is_set_aside_and_can_come_back);
 	tcase_add_test(tests, nobody_else_reads_the_catalogue);
