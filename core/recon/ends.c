@@ -338,44 +338,67 @@ static void blend_slice(const struct ends *ends, int slice, double doubt, const 
 	}
 }
 
-/* Change of a slice, means over the body in 1/mm. */
+/* Change of a slice, means over the body in 1/mm, without its outline, where FDK and iterations differ anywhere. */
 struct slice_change {
 	double corrected; /* of |V' - V| */
 	double departure; /* |of V' - B| */
 };
 
-static struct slice_change change_of(const struct ends *ends, const float *start, const float *before,
-				     const float *after)
+/* True for a voxel of the body with the body on all four sides in its slice, as far as there are voxels. */
+static bool is_within(const struct ends *ends, const float *start, const float *values, int x, int y)
 {
-	struct slice_change change = {0};
-	double departure = 0;
+	static const int sides[][2] = {{0, 0}, {-1, 0}, {1, 0}, {0, -1}, {0, 1}};
+
+	for (int k = 0; k < (int)(sizeof(sides) / sizeof(*sides)); k++) {
+		const size_t at = (size_t)clamp(y + sides[k][1], ends->rows) * (size_t)ends->columns +
+				  (size_t)clamp(x + sides[k][0], ends->columns);
+
+		if (!is_body(ends, start[at], values[at]))
+			return false;
+	}
+	return true;
+}
+
+/* False where the body is too little in the slice to say something. */
+static bool change_of(const struct ends *ends, const float *start, const float *before, const float *after,
+		      struct slice_change *ret_change)
+{
+	double corrected = 0, departure = 0;
 	size_t count = 0;
 
-	for (size_t i = 0; i < ends->pixels; i++)
-		if (is_body(ends, start[i], before[i])) {
-			change.corrected += fabs((double)after[i] - (double)before[i]);
+	for (int y = 0; y < ends->rows; y++)
+		for (int x = 0; x < ends->columns; x++) {
+			const size_t i = (size_t)y * (size_t)ends->columns + (size_t)x;
+
+			if (!is_within(ends, start, before, x, y))
+				continue;
+			corrected += fabs((double)after[i] - (double)before[i]);
 			departure += (double)after[i] - (double)start[i];
 			count++;
 		}
 	if (count < BODY_LEAST)
-		return (struct slice_change){0};
-	change.corrected /= (double)count;
-	change.departure = fabs(departure) / (double)count;
-	return change;
+		return false;
+	*ret_change = (struct slice_change){corrected / (double)count, fabs(departure) / (double)count};
+	return true;
 }
 
-/* The slices whose change is too large to say nothing of it. The innermost one shows what d is without an end. */
+/*
+ * The slices whose change is too large to say nothing of it. The innermost one with enough of the body shows what d is
+ * without an end.
+ */
 static void report_end(const struct ends *ends, int end, struct ends_report *report)
 {
 	const float *start = ends->start + (size_t)(end * ends->zone) * ends->pixels;
 	const float *before = ends->held + (size_t)(end * ends->inner) * ends->pixels;
-	double usual = 0;
+	double usual = NAN;
 
 	for (int i = ends->inner - 1; i >= 0; i--) {
 		const size_t at = (size_t)i * ends->pixels;
-		const struct slice_change change = change_of(ends, start + at, before + at, ends->values + at);
+		struct slice_change change;
 
-		if (i == ends->inner - 1)
+		if (!change_of(ends, start + at, before + at, ends->values + at, &change))
+			continue;
+		if (isnan(usual))
 			usual = change.departure;
 		if (change.corrected <= LITTLE * ends->level && change.departure - usual <= LITTLE * ends->level)
 			continue;

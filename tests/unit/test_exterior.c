@@ -840,6 +840,30 @@ START_TEST(the_end_slices_are_no_worse_than_those_of_fdk_where_a_body_ends)
 }
 END_TEST
 
+/* A rod that goes on far beyond both faces, beside a plate that ends well within: FDK blurs their outlines in all
+ * slices. */
+START_TEST(a_rod_that_goes_on_ends_in_no_slice)
+{
+	const struct orbit_spec spec = {48, 36, 60, {620, 1100, {5, 5}, {0, 0}, {0, 0}}, 0, 6};
+	struct ellipsoid parts[] = {
+	    {.shape = SHAPE_CYLINDER, .semi_axes = {7, 3.7, 90}, .centre = {-16, -15, 0}, .density = 2.5 * MU_WATER},
+	    {.shape = SHAPE_ELLIPSOID, .semi_axes = {36, 2.9, 14}, .centre = {-28, -15, 0}, .density = MU_WATER},
+	};
+	const struct phantom phantom = {.count = 2, .parts = parts};
+	struct grid grid = grid_of(40, 40, 14, 3, 3, 3);
+	struct recipe recipe = sart_on(&grid);
+	struct outcome outcome = {0};
+	struct scene scene;
+
+	scene_orbit(&scene, &spec);
+	scene_add(&scene, &phantom);
+	run(&scene, &recipe, &outcome);
+	ck_assert_msg(strstr(outcome.warnings, "end_slices: ") == NULL, "%s", outcome.warnings);
+	outcome_clear(&outcome);
+	scene_clear(&scene);
+}
+END_TEST
+
 /* With any number of threads, and behind a yield; the iterate itself goes on as it is. */
 START_TEST(the_end_slices_are_the_same_bits_with_other_threads_and_after_a_yield)
 {
@@ -905,6 +929,7 @@ Suite *exterior_suite(void)
 	tcase_add_loop_test(truncated, a_body_that_is_spread_beyond_the_field_of_view_is_told, 0, 6);
 	suite_add_tcase(suite, truncated);
 	tcase_add_loop_test(last, the_end_slices_are_no_worse_than_those_of_fdk_where_a_body_ends, 0, COUNT(ended));
+	tcase_add_test(last, a_rod_that_goes_on_ends_in_no_slice);
 	tcase_add_loop_test(last, the_end_slices_are_the_same_bits_with_other_threads_and_after_a_yield, 0, 2);
 	suite_add_tcase(suite, last);
 	suite_add_tcase(suite, bits);
