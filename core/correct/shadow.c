@@ -4,6 +4,8 @@
 #include <math.h>
 #include <stdlib.h>
 
+#include "core/correct/round.h"
+
 enum { LINES = 4 }; /* of a segment that are looked at, most */
 enum { COUNT_LEAST = 16, LIT_LEAST = 8 };
 
@@ -13,6 +15,9 @@ static const float SHARE = 0.3F, ALLOWANCE = 0.05F; /* of the step */
 static const float SHARP = 0.6F;                    /* of the largest fall that a penumbra has between two bins */
 static const float PENUMBRA = 0.05F, PENUMBRA_LEAST = 0.02F;
 static const double WIDEST = 0.4, VIEWS = 0.85, FULL = 0.25, LESS = 0.3;
+/* Of the step: how far rings about the axis may be from the profile, and how much more it falls beyond a shell's cusp.
+ */
+static const double RINGS = 0.15, CUSP = 0.5;
 
 /* Profiles across one direction. */
 struct profiles {
@@ -20,6 +25,7 @@ struct profiles {
 	size_t step, line;  /* samples from a pixel to the next, and from a line to the next */
 	int bins, segments; /* bins of a profile */
 	double axis;        /* bin of the image of the rotation's axis; NAN where that is not along the lines */
+	double *distances;  /* [bins + 1], of the rays at the bins' edges from the axis, mm, below 0 on one side */
 	float *values;      /* [view][bin][segment], line integrals; NAN where nothing is good */
 };
 
@@ -28,6 +34,12 @@ struct shadow {
 	struct profiles profiles[2]; /* across columns, across rows */
 	int most, views;
 };
+
+/* The first of `count` things that belongs to part i of `parts`. */
+static int part_begin(int i, int parts, int count)
+{
+	return (int)((long long)i * count / parts);
+}
 
 /* Where along columns (0) or rows (1) the image of z lies at the isocentre, pixels; NAN where it runs along them. */
 static double axis_pixel(const struct geometry *geometry, int direction)
@@ -44,6 +56,25 @@ static double axis_pixel(const struct geometry *geometry, int direction)
 		    fabs(beside[direction] - at[direction]) >= fabs(beside[1 - direction] - at[1 - direction]))
 			return NAN;
 		sum += at[direction];
+	}
+	return sum / geometry->count;
+}
+
+/* How far the rays at a place along columns (0) or rows (1) pass the axis on the detector's middle line, mm. */
+static double axis_distance(const struct geometry *geometry, int direction, double pixel)
+{
+	const double place[2] = {direction == 0 ? pixel : 0.5 * (geometry->columns - 1),
+				 direction == 1 ? pixel : 0.5 * (geometry->rows - 1)};
+	double sum = 0;
+
+	for (int k = 0; k < geometry->count; k++) {
+		const struct view *view = &geometry->views[k];
+		double way[2];
+
+		for (int i = 0; i < 2; i++)
+			way[i] = view->pixel0[i] + place[0] * view->column_step[i] + place[1] * view->row_step[i] -
+				 view->source[i];
+		sum += (view->source[0] * way[1] - view->source[1] * way[0]) / hypot(way[0], way[1]);
 	}
 	return sum / geometry->count;
 }
@@ -80,10 +111,14 @@ int shadow_new(const struct linearise *linearise, const struct geometry *geometr
 		profiles->axis = (axis_pixel(geometry, axis) + 0.5) * profiles->bins / profiles->pixels - 0.5;
 		profiles->values = calloc((size_t)views * (size_t)profiles->bins * (size_t)profiles->segments,
 					  sizeof(*profiles->values));
-		if (profiles->values == NULL) {
+		profiles->distances = calloc((size_t)profiles->bins + 1, sizeof(*profiles->distances));
+		if (profiles->values == NULL || profiles->distances == NULL) {
 			shadow_free(shadow);
 			return error_set(err, ERR_NO_MEMORY, "no memory to look for shadows");
 		}
+		for (int bin = 0; bin <= profiles->bins; bin++)
+			profiles->distances[bin] =
+			    axis_distance(geometry, axis, part_begin(bin, profiles->bins, profiles->pixels) - 0.5);
 	}
 	*ret_shadow = shadow;
 	return 0;
@@ -93,18 +128,14 @@ void shadow_free(struct shadow *shadow)
 {
 	if (shadow == NULL)
 		return;
-	free(shadow->profiles[0].values);
-	free(shadow->profiles[1].values);
+	for (int axis = 0; axis < 2; axis++) {
+		free(shadow->profiles[axis].values);
+		free(shadow->profiles[axis].distances);
+	}
 	free(shadow);
 }
 
 /* ---- profiles ---- */
-
-/* The first of `count` things that belongs to part i of `parts`. */
-static int part_begin(int i, int parts, int count)
-{
-	return (int)((long long)i * count / parts);
-}
 
 /* The transmission of a pixel, or its line integral where the samples are such; NAN where it says nothing. */
 static float value_of(const struct linearise *linearise, const void *samples, size_t at)
@@ -337,12 +368,72 @@ static bool is_an_edge(const struct edge *edge, int dark, int length, const stru
 	return length == 1;
 }
 
+/* The mean over all views of the border's segments; NAN where nothing is good. */
+static double mean_of(const struct edge *edge, int bin, const struct border *border)
+{
+	double sum = 0;
+	int count = 0;
+
+	for (int view = 0; view < edge->views; view++)
+		for (int segment = border->first; segment < border->end; segment++) {
+			const float value = edge_value(edge, view, bin, segment);
+
+			if (isnan(value))
+				continue;
+			sum += (double)value;
+			count++;
+		}
+	return count > 0 ? sum / count : NAN;
+}
+
+/* True if rings about the axis have these means from the detector's edge inwards, so many on this side of the axis. */
+static bool rings_have(const struct edge *edge, const double *means, int bins, double most)
+{
+	double *edges = malloc((size_t)(2 * bins + 1) * sizeof(*edges)), *values = edges + bins + 1, differ = INFINITY;
+
+	if (edges == NULL)
+		return false;
+	for (int i = 0; i <= bins; i++)
+		edges[i] = fabs(edge->profiles->distances[edge->behind ? edge->profiles->bins - bins + i : bins - i]);
+	for (int i = 0; i < bins; i++)
+		values[i] = means[bins - 1 - i];
+	if (!round_nearest(edges, values, bins, &differ))
+		differ = INFINITY;
+	free(edges);
+	return differ <= most;
+}
+
 /*
- * True if the same step is found where the object would have it once more, as far on the other side of the axis, and
- * not as the border of a shadow that comes from the other edge. The rays there are those of the opposite views: what
- * the object has at one place of all profiles it has at both, a collimator at one.
+ * True if the step is the cusp of a shell about the axis that the detector cuts: rings about the axis explain the
+ * profile, as they do the mean of all views of whatever turns once, and outwards of it, where the rays cross the shell
+ * alone, it falls more steeply than within. Behind a collimator it goes on as it does beside it.
  */
-static bool has_twin(const struct edge *edge, int dark, int length, const struct border *border)
+static bool is_a_shell(const struct edge *edge, int dark, int length, const struct border *border)
+{
+	const int within = dark + length, inwards = within + dark;
+	const double axis = edge->behind ? edge->profiles->bins - 1 - edge->profiles->axis : edge->profiles->axis;
+	const int bins = (int)floor(axis + 0.5); /* whole ones on this side */
+	double means[SHADOW_BINS] = {0}, step;
+
+	if (dark == 0 || inwards >= bins || bins > edge->profiles->bins)
+		return false;
+	for (int bin = 0; bin < bins; bin++)
+		means[bin] = mean_of(edge, bin, border);
+	step = means[dark] - means[within];
+	for (int bin = 0; bin < bins; bin++)
+		if (isnan(means[bin]))
+			return false;
+	return means[dark] - means[0] - (means[inwards] - means[within]) >= CUSP * step &&
+	       rings_have(edge, means, bins, RINGS * step);
+}
+
+/*
+ * True if the step is the object's. It is where the object has it once more as far on the other side of the axis, and
+ * not as the border of a shadow that comes from the other edge: the rays there are those of the opposite views, and
+ * what the object has at one place of all profiles it has at both, a collimator at one. It is, too, where it is that of
+ * a shell, which may well be cut on both sides alike, or seen on one alone.
+ */
+static bool is_of_the_object(const struct edge *edge, int dark, int length, const struct border *border)
 {
 	const int bins = edge->profiles->bins;
 	const double axis = edge->behind ? bins - 1 - edge->profiles->axis : edge->profiles->axis;
@@ -361,7 +452,7 @@ static bool has_twin(const struct edge *edge, int dark, int length, const struct
 		    !reaches_edge(&other, twin, &found))
 			return true;
 	}
-	return false;
+	return is_a_shell(edge, dark, length, border);
 }
 
 /* The bins of the shadow's border that are partly in shadow are taken for shadow. */
@@ -386,7 +477,7 @@ static struct border find_border(const struct edge *edge)
 
 			if (!border_at(edge, dark, dark + length, &border) || border.step <= best.step ||
 			    !reaches_edge(edge, dark, &border) || !stands_alone(edge, dark, length, &border) ||
-			    !is_an_edge(edge, dark, length, &border) || has_twin(edge, dark, length, &border))
+			    !is_an_edge(edge, dark, length, &border) || is_of_the_object(edge, dark, length, &border))
 				continue;
 			border.bins = penumbra_end(edge, dark + length, &border);
 			if (border.bins <= most)

@@ -18,8 +18,11 @@
  * behind it. An object has no such edge: its own step changes along it and from view to view, or goes on on one side,
  * as the slope of a plate does that is seen from above or of a tube's wall that leaves the detector, or falls by equal
  * line integrals and not by equal parts of the light. What looks the same from all sides has the step twice, as far on
- * either side of the axis; a detector that is displaced sees both. 15 % of the views may differ in a
- * segment, for metal and noise, and segments at the ends that lie in a shadow of the other direction.
+ * either side of the axis; a detector that is displaced sees both. Nor is it a shadow where it is the cusp of a shell
+ * that the detector cuts, a skull's or a bottle's: rings about the axis explain the profile (round.h), and beyond the
+ * step it falls by half of it more than within. A faint shadow before something round that is as wide as the detector
+ * may look like one, and is not found then. 15 % of the views may differ in a segment, for metal and noise, and
+ * segments at the ends that lie in a shadow of the other direction.
  *
  * None is found where nothing is seen beside the shadows: they might be all of a wide, flat object.
  */

@@ -16,7 +16,7 @@ static const float FLAT = 60000;
 /*
  * HEAD ends within the detector, WIDE nowhere; DISCS are seen edge on, as wide as the detector; the PLATE that a body
  * stands on is wider than the field and seen from above, the TUBE's wall lies just outside of it; a ROD stands in a
- * PIPE.
+ * PIPE; the outside of the SHELLS, within the first of which the detector ends in the bone, lies beyond it.
  */
 enum object {
 	HEAD,
@@ -30,11 +30,15 @@ enum object {
 	TUBE_ASIDE,
 	BROAD_DISC,
 	ROD_IN_PIPE,
+	CUT_SHELL,
+	CUT_SHELL_ASIDE,
+	CUT_BOTTLE,
 	OBJECTS
 };
 static const char *const names[] = {
-    "head",        "wide body",  "discs", "metal",         "wide body that ends in the middle", "plate", "tube",
-    "tube nearer", "tube aside", "disc",  "rod in a pipe",
+    "head",          "wide body", "discs",       "metal",      "wide body that ends in the middle",
+    "plate",         "tube",      "tube nearer", "tube aside", "disc",
+    "rod in a pipe", "shell",     "shell aside", "bottle",
 };
 static const struct ellipsoid objects[OBJECTS][PARTS_MOST] = {
     [HEAD] = {{.shape = SHAPE_ELLIPSOID, .semi_axes = {72, 84, 110}, .density = .035},
@@ -64,6 +68,14 @@ static const struct ellipsoid objects[OBJECTS][PARTS_MOST] = {
     [ROD_IN_PIPE] = {{.shape = SHAPE_CYLINDER, .semi_axes = {54, 54, 80}, .density = .0192},
 		     {.shape = SHAPE_CYLINDER, .semi_axes = {40, 40, 80}, .density = -.0192},
 		     {.shape = SHAPE_CYLINDER, .semi_axes = {16, 16, 80}, .density = .0205}},
+    [CUT_SHELL] = {{.shape = SHAPE_CYLINDER, .semi_axes = {114, 114, 250}, .density = .0384},
+		   {.shape = SHAPE_CYLINDER, .semi_axes = {103, 103, 250}, .density = -.0192}},
+    [CUT_SHELL_ASIDE] =
+	{{.shape = SHAPE_CYLINDER, .semi_axes = {114, 114, 250}, .centre = {1, 0, 0}, .density = .0384},
+	 {.shape = SHAPE_CYLINDER, .semi_axes = {103, 103, 250}, .centre = {1, 0, 0}, .density = -.0192}},
+    [CUT_BOTTLE] = {{.shape = SHAPE_CYLINDER, .semi_axes = {118, 118, 250}, .density = .0384},
+		    {.shape = SHAPE_CYLINDER, .semi_axes = {104, 104, 250}, .density = -.0192},
+		    {.shape = SHAPE_CYLINDER, .semi_axes = {20, 20, 250}, .centre = {30, 0, 0}, .density = .006}},
     [BROAD_DISC] = {{.shape = SHAPE_CYLINDER, .semi_axes = {60, 60, 50}, .density = .0192},
 		    {.shape = SHAPE_CYLINDER, .semi_axes = {300, 300, 12}, .centre = {0, 0, -62}, .density = .0192}},
 };
@@ -148,7 +160,7 @@ START_TEST(a_shadow_is_found_to_the_pixel)
 	    {{14, 0}, {14, 0}, .3}, {{14, 0}, {14, 0}, 0}, {{2, 0}, {0, 0}, .1},   {{1, 0}, {3, 0}, .5},
 	    {{0, 10}, {0, 9}, .02}, {{0, 0}, {0, 4}, .5},  {{10, 6}, {9, 7}, .05}, {{10, 6}, {9, 7}, 0},
 	};
-	static const enum object seen[] = {HEAD, WIDE, METAL};
+	static const enum object seen[] = {HEAD, WIDE, METAL, ROD_IN_PIPE};
 	const struct leaf *leaf = &leaves[_i];
 
 	for (size_t k = 0; k < sizeof(seen) / sizeof(*seen); k++)
