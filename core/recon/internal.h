@@ -143,6 +143,9 @@ static inline bool recipe_has_restraint(const struct recipe *recipe)
 	       !recipe->metal.on;
 }
 
+/* True if TV finds too little noise in the FDK volume to take anything of it. */
+bool recon_spares_fdk(const struct recon *recon);
+
 /* The options point into recon, which is described, has its input, and its weights where FDK is on. */
 struct plan_options plan_options(const struct recon *recon);
 

@@ -171,6 +171,17 @@ static int open_rim(struct recon *recon, struct error *err)
 	return rim_new(&recipe->grid, &recon->orbit, recipe->iterate.nonnegative, &recon->rim, err);
 }
 
+static int open_restraint(struct recon *recon, struct error *err)
+{
+	const struct recipe *recipe = &recon->recipe;
+	const struct edge_blur edges = edges_blur(&recipe->grid, &recon->orbit, recipe->fdk.window, recipe->fdk.cutoff);
+
+	if (!recipe_has_restraint(recipe))
+		return 0;
+	return restraint_new(&recipe->grid, recipe->mu_water, recon->orbit.pixel_at_isocentre[0], &edges,
+			     recipe->iterate.nonnegative, &recon->restraint, err);
+}
+
 /* The views of a recipe that refines the geometry, and the time that it takes. */
 static int open_refining(struct recon *recon, struct error *err)
 {
@@ -221,9 +232,8 @@ int recon_open(const struct backend *backend, struct device *device, const struc
 		code = open_ends(recon, err);
 	if (code == 0)
 		code = open_rim(recon, err);
-	if (code == 0 && recipe_has_restraint(&recon->recipe))
-		code = restraint_new(&recon->recipe.grid, recon->recipe.mu_water, recon->orbit.pixel_at_isocentre[0],
-				     recon->recipe.iterate.nonnegative, &recon->restraint, err);
+	if (code == 0)
+		code = open_restraint(recon, err);
 	if (code == 0 && recon->recipe.algorithm != NULL)
 		code = alternation_new(&recon->recipe.grid, recon->geometry, recon->recipe.mu_water,
 				       &recon->alternation, err);

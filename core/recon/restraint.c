@@ -36,6 +36,7 @@ struct node {
 struct restraint {
 	struct grid grid;
 	double mu_water, blur; /* 1/mm; of FDK, mm */
+	struct edge_blur edges;
 	bool nonnegative;
 	int cells[3];
 	size_t slice, voxels;
@@ -69,11 +70,12 @@ size_t restraint_bytes(const struct grid *grid)
 	if (grid->size[0] < 4 * CELL || grid->size[1] < 4 * CELL || grid->size[2] < CELL)
 		return 0;
 	return restraint_kept_bytes(grid) + cells_of(grid) * (sizeof(struct cell) + sizeof(float)) +
-	       nodes_of(grid) * sizeof(struct node) + 2 * slice * sizeof(float) + places_bytes(grid);
+	       nodes_of(grid) * sizeof(struct node) + 2 * slice * sizeof(float) + places_bytes(grid) +
+	       edges_bytes(grid);
 }
 
-int restraint_new(const struct grid *grid, double mu_water, double blur, bool nonnegative,
-		  struct restraint **ret_restraint, struct error *err)
+int restraint_new(const struct grid *grid, double mu_water, double blur, const struct edge_blur *edges,
+		  bool nonnegative, struct restraint **ret_restraint, struct error *err)
 {
 	struct restraint *restraint;
 
@@ -87,6 +89,7 @@ int restraint_new(const struct grid *grid, double mu_water, double blur, bool no
 	    .grid = *grid,
 	    .mu_water = mu_water,
 	    .blur = blur,
+	    .edges = *edges,
 	    .nonnegative = nonnegative,
 	    .cells = {grid->size[0] / CELL, grid->size[1] / CELL, grid->size[2] / CELL},
 	    .slice = (size_t)grid->size[0] * (size_t)grid->size[1],
@@ -94,6 +97,11 @@ int restraint_new(const struct grid *grid, double mu_water, double blur, bool no
 	};
 	*ret_restraint = restraint;
 	return 0;
+}
+
+bool restraint_has_edges(const struct restraint *restraint)
+{
+	return restraint->edges.share > 0;
 }
 
 void restraint_free(struct restraint *restraint)
@@ -612,7 +620,7 @@ static int find_places(const struct restraint *restraint, struct showing *showin
 	return 0;
 }
 
-int restraint_show(struct restraint *restraint, const struct backend *backend, struct volume *volume,
+int restraint_show(struct restraint *restraint, const struct backend *backend, struct volume *volume, bool is_fdk,
 		   const struct correction_chain *dense, struct restraint_report *ret_report, struct error *err)
 {
 	const int step = restraint->lost ? 1 : (restraint->cells[2] - 1) / LAYERS_MOST + 1;
@@ -648,6 +656,11 @@ int restraint_show(struct restraint *restraint, const struct backend *backend, s
 	}
 	places_free(places);
 	scratch_free(&scratch);
+	if (code == 0 && restraint_has_edges(restraint) && is_fdk && !restraint->metal && !restraint->holds_dense) {
+		report.changed = true;
+		code = edges_show(&restraint->edges, &restraint->grid, restraint->mu_water, restraint->nonnegative,
+				  restraint->start, backend, volume, err);
+	}
 	report.restored = showing.counts[0] > 0 ? (double)showing.counts[1] / (double)showing.counts[0] : 0;
 	if (code == 0)
 		*ret_report = report;

@@ -3,6 +3,7 @@
 
 #include "core/backend.h"
 #include "core/correct/correction.h"
+#include "core/recon/restraint_edges.h"
 
 /*
  * How far the default's iterations are followed, where they may come out worse than FDK: beside what is very dense, and
@@ -39,6 +40,9 @@
  * Metal. Where the rays through what is very dense are left out of the iterations (core/correct/dense.c), the others
  * move it all the same, by 50 to 3000 HU. V' has FDK's own values there.
  *
+ * Edges. Where FDK blurs no more than a voxel does, V' has edges that are the mean of both
+ * (core/recon/restraint_edges.h), unless there is something as dense as metal, or so much noise that TV takes of FDK's.
+ *
  * Only volumes that are kept have V'; the iterate goes on as it is. tests/bench/results/dense.txt has the figures and
  * what else was tried. One thread at a time; the same bits for any number of threads.
  */
@@ -59,9 +63,11 @@ struct restraint_report {
 
 /* Bytes of the host's memory, once it has begun; 0: restraint_new makes nothing, the grid has too few voxels. */
 size_t restraint_bytes(const struct grid *grid);
-/* blur: the width of FDK's, mm. */
-int restraint_new(const struct grid *grid, double mu_water, double blur, bool nonnegative,
-		  struct restraint **ret_restraint, struct error *err);
+/* blur: the width of FDK's, mm; edges: the same beside a voxel's. */
+int restraint_new(const struct grid *grid, double mu_water, double blur, const struct edge_blur *edges,
+		  bool nonnegative, struct restraint **ret_restraint, struct error *err);
+/* Whether FDK's edges may be better, so that it is to begin in any case. */
+bool restraint_has_edges(const struct restraint *restraint);
 void restraint_free(struct restraint *restraint); /* NULL is fine */
 
 /* Notes what TV took of FDK's means. Before restraint_begin. */
@@ -77,8 +83,9 @@ size_t restraint_state_bytes(const struct restraint *restraint);
 const void *restraint_state(const struct restraint *restraint);
 int restraint_resume(struct restraint *restraint, const char *bytes, struct error *err);
 
-/* V becomes V', where it has begun. dense: what has the traces of the rays that were left out; or NULL. */
-int restraint_show(struct restraint *restraint, const struct backend *backend, struct volume *volume,
+/* V becomes V', where it has begun. is_fdk: S is FDK's volume, of which TV has taken nothing. dense: what has the
+ * traces of the rays that were left out; or NULL. */
+int restraint_show(struct restraint *restraint, const struct backend *backend, struct volume *volume, bool is_fdk,
 		   const struct correction_chain *dense, struct restraint_report *ret_report, struct error *err);
 
 #endif

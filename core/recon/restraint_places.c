@@ -75,7 +75,7 @@ int places_new(const struct grid *grid, double mu_water, double blur, struct pla
 	for (int axis = 0; axis < 3; axis++)
 		places->cells[axis] = grid->size[axis] / CELL;
 	for (int axis = 0; axis < 2; axis++)
-		places->reach[axis] = (int)lround(2 * fmin(BLUR_MOST, fmax(1, blur / grid->spacing[axis])));
+		places->reach[axis] = (int)lround(PLACE_REACH * fmin(BLUR_MOST, fmax(1, blur / grid->spacing[axis])));
 	places->near = malloc(cells_of(grid) * sizeof(*places->near));
 	places->far = malloc(cells_of(grid) * sizeof(*places->far));
 	places->even = malloc(cells_of(grid) * sizeof(*places->even));
@@ -116,17 +116,14 @@ static float roughness(const float *at, int columns)
 	return at[0] - 0.25f * (at[-1] + at[1] + at[-columns] + at[columns]);
 }
 
-/* u of a voxel of S. */
-static float evenness(const struct places *places, const float *start, int x, int y)
+float place_evenness(const int size[2], const int reach[2], float mu_water, const float *slice, int x, int y)
 {
-	const int size[2] = {places->grid->size[0], places->grid->size[1]}, at[2] = {x, y}, stride[2] = {1, size[0]};
-	const float *here = start + (ptrdiff_t)y * size[0] + x, unit = (float)EVEN * places->mu_water / 1000;
+	const int at[2] = {x, y}, stride[2] = {1, size[0]};
+	const float *here = slice + (ptrdiff_t)y * size[0] + x, unit = (float)EVEN * mu_water / 1000;
 	float low = *here, high = *here;
 
-	if (!(*here > (float)OBJECT * places->mu_water))
-		return 0;
 	for (int axis = 0; axis < 2; axis++)
-		for (int i = -places->reach[axis]; i <= places->reach[axis]; i++)
+		for (int i = -reach[axis]; i <= reach[axis]; i++)
 			if (at[axis] + i >= 0 && at[axis] + i < size[axis]) {
 				const float value = here[i * stride[axis]];
 
@@ -134,6 +131,14 @@ static float evenness(const struct places *places, const float *start, int x, in
 				high = value > high ? value : high;
 			}
 	return fminf(fmaxf(2 - (high - low) / unit, 0), 1);
+}
+
+/* u of a voxel of S. */
+static float evenness(const struct places *places, const float *start, int x, int y)
+{
+	if (!(start[(ptrdiff_t)y * places->grid->size[0] + x] > (float)OBJECT * places->mu_water))
+		return 0;
+	return place_evenness(places->grid->size, places->reach, places->mu_water, start, x, y);
 }
 
 static void add_voxel(const struct places *places, const float *start, const float *values, int x, int y,
@@ -286,8 +291,7 @@ int places_see(struct places *places, const struct correction_chain *dense, stru
 
 /* ---- a slice ---- */
 
-/* A voxel's place between the middles of two cubes: the first of them, and the second one's share. */
-static int between(int voxel, int cells, float *ret_share)
+int place_between(int voxel, int cells, float *ret_share)
 {
 	const float place = fminf(fmaxf(((float)voxel + 0.5f) / CELL - 0.5f, 0), (float)(cells - 1));
 	const int first = (int)place < cells - 1 ? (int)place : cells > 1 ? cells - 2 : 0;
@@ -305,7 +309,7 @@ static void line_at(const struct places *places, int y, int z, struct line *ret)
 {
 	const int *count = places->cells;
 	float share[2];
-	const int row = between(y, count[1], &share[0]), layer = between(z, count[2], &share[1]);
+	const int row = place_between(y, count[1], &share[0]), layer = place_between(z, count[2], &share[1]);
 
 	memset(ret->of, 0, (size_t)count[0] * sizeof(ret->of[0]));
 	for (int corner = 0; corner < 4; corner++) {
@@ -374,7 +378,7 @@ void places_restrain(struct places *places, int z, double most, const float *sta
 			const ptrdiff_t at = (ptrdiff_t)y * columns + x;
 			const float edge = 1 - evenness(places, start, x, y);
 			float share;
-			const int first = between(x, places->cells[0], &share);
+			const int first = place_between(x, places->cells[0], &share);
 			const float spread = EDGE * along_line(&line, first, share, SPREAD);
 			float w = along_line(&line, first, share, SHARE);
 

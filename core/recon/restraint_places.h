@@ -30,6 +30,13 @@ double places_kept(double w);
 /* Voxels a side of a cube; the same as the restraint's. */
 enum { PLACE_CELL = 4, PLACE_VIEWS = 60 };
 
+/* Voxels that two widths of FDK's blur have, where that is at most a voxel. */
+enum { PLACE_REACH = 2 };
+/* u of a voxel of a slice [y][x] of size voxels, asked as far as reach, also outside of the object. */
+float place_evenness(const int size[2], const int reach[2], float mu_water, const float *slice, int x, int y);
+/* A voxel's place between the middles of two cubes along an axis: the first of them, and the second one's share. */
+int place_between(int voxel, int cells, float *ret_share);
+
 size_t places_bytes(const struct grid *grid);
 /* blur: the width of FDK's, mm. */
 int places_new(const struct grid *grid, double mu_water, double blur, struct places **ret_places, struct error *err);

@@ -37,6 +37,11 @@ static double tv_alpha(const struct recon *recon, enum noise_stage stage)
 	return noise_alpha(&recon->noise, recipe, &recon->orbit, stage);
 }
 
+bool recon_spares_fdk(const struct recon *recon)
+{
+	return tv_alpha(recon, NOISE_OF_FDK) == INFINITY;
+}
+
 static void tell_noise(const struct recon *recon)
 {
 	const struct recipe *recipe = &recon->recipe;
@@ -471,7 +476,9 @@ static int begin_restraint(struct recon *recon, struct error *err)
 {
 	const bool dense = recon->norms.maximum >= RESTRAINT_DENSE * recon->recipe.mu_water;
 
-	if (recon->restraint == NULL || recon->iteration > 0 || !(dense || recon->outside))
+	if (recon->restraint == NULL || recon->iteration > 0)
+		return 0;
+	if (!dense && !recon->outside && !(restraint_has_edges(recon->restraint) && recon_spares_fdk(recon)))
 		return 0;
 	return restraint_begin(recon->restraint, recon->backend, recon->volume, err);
 }

@@ -9,6 +9,7 @@
 
 #include "core/correct/averaging.h"
 #include "core/recon/algorithm.h"
+#include "core/recon/restraint_edges.h"
 #include "tests/unit/anatomy.h"
 #include "tests/unit/scene.h"
 
@@ -265,6 +266,79 @@ START_TEST(iterations_of_a_skull_on_coarse_voxels_are_no_worse_than_fdk)
 }
 END_TEST
 
+/* Three pixels of Hann's window blur as much as a voxel along a row, and less along the axis. */
+START_TEST(fdk_s_blur_is_known_beside_a_voxel_s)
+{
+	static const struct {
+		double pixels, cutoff;
+		enum window window;
+		float excess[2], share;
+	} cases[] = {
+	    {3, 1, WINDOW_HANN, {0, -1. / 36}, 1},        {2.5, 1, WINDOW_HANN, {.01833f, -.02167f}, 1},
+	    {2, 1, WINDOW_HANN, {.05208f, -.01042f}, 0},  {2, 1, WINDOW_RAM_LAK, {-.01042f, -.01042f}, 1},
+	    {3, .5, WINDOW_HANN, {.08333f, -1. / 36}, 0},
+	};
+	for (size_t k = 0; k < sizeof(cases) / sizeof(cases[0]); k++) {
+		const struct orbit orbit = {.pixel_at_isocentre = {1, 1}};
+		const double mm = cases[k].pixels;
+		const struct grid grid = grid_of(8, 8, 8, mm, mm, mm);
+		const struct edge_blur blur = edges_blur(&grid, &orbit, cases[k].window, cases[k].cutoff);
+
+		ck_assert_float_eq_tol(blur.excess[0], cases[k].excess[0], 1e-4f);
+		ck_assert_float_eq_tol(blur.excess[1], cases[k].excess[0], 1e-4f);
+		ck_assert_float_eq_tol(blur.excess[2], cases[k].excess[1], 1e-4f);
+		ck_assert_float_eq_tol(blur.share, cases[k].share, 1e-4f);
+	}
+}
+END_TEST
+
+/*
+ * A body with a rod of bone on voxels of three pixels, no noise, which goes on beyond the grid: ten iterations had 16.3
+ * HU in the middle slices where FDK has 15.8, for its edges are as good as a voxel allows. Of one that ends there,
+ * iterations are the better in any case.
+ */
+START_TEST(edges_that_fdk_shows_as_well_are_the_mean_of_both)
+{
+	enum { ACROSS = 32, HIGH = 20, FROM = 5 };
+	const double voxel = 2, pixel = voxel / 3, water = .0192, high = _i == 0 ? 80 : 17;
+	struct ellipsoid parts[] = {
+	    {SHAPE_CYLINDER, {25, 21, high}, {.7, -.4, 0}, 0, water},
+	    {SHAPE_CYLINDER, {6, 6, high}, {-10, 2, 0}, 0, .7 * water},
+	    {SHAPE_ELLIPSOID, {4, 4, 4}, {8, 9, 1}, 0, .04 * water},
+	};
+	const struct phantom body = {3, parts};
+	const struct orbit_spec spec = {
+	    112, 74, 80, {620, 1100, {pixel / 620 * 1100, pixel / 620 * 1100}, {0, 0}, {0, 0}}, 0, 2.5};
+	const struct grid grid = grid_of(ACROSS, ACROSS, HIGH, voxel, voxel, voxel);
+	const size_t first = FROM * ACROSS * ACROSS, count = (HIGH - 2 * FROM) * ACROSS * ACROSS;
+	float *truth = malloc(sizeof(*truth) * grid_voxels(&grid));
+	struct recipe recipe = recipe_on(&grid);
+	struct outcome outcome = {.threads = 1};
+	int emit[] = {EMIT_FDK};
+	struct scene scene;
+	double fdk, last;
+
+	ck_assert_ptr_nonnull(truth);
+	phantom_voxelise(&body, &grid, 5, truth);
+	scene_orbit(&scene, &spec);
+	scene_add(&scene, &body);
+	recipe.fdk.on = true;
+	recipe.emit = emit;
+	recipe.emits = 1;
+	recipe_set_algorithm(&recipe, &algorithm_sart);
+	recipe.tv.on = true;
+	run(&scene, &recipe, &outcome);
+	fdk = body_error(outcome_volume(&outcome, "fdk") + first, truth + first, count);
+	last = body_error(outcome_volume(&outcome, "final") + first, truth + first, count);
+	ck_assert_msg(last < .97 * fdk, "FDK %.1f HU, SART %.1f", fdk, last);
+	if (_i == 0)
+		expect_same_after_a_yield(&scene, &recipe, 2, &outcome);
+	outcome_clear(&outcome);
+	scene_clear(&scene);
+	free(truth);
+}
+END_TEST
+
 /*
  * The default on an object of two pixels a voxel: what is made of voxels keeps all of them, as their rows show, and
  * ends far below FDK; what has edges does not. With fewer pixels, and with TV in numbers, nothing is decided.
@@ -345,9 +419,10 @@ END_TEST
 Suite *averaging_suite(void)
 {
 	Suite *suite = suite_create("averaging");
-	TCase *decision = tcase_create("decision");
+	TCase *decision = tcase_create("decision"), *edges = tcase_create("edges");
 
 	tcase_set_timeout(decision, 0);
+	tcase_set_timeout(edges, 0);
 	tcase_add_loop_test(decision, an_object_of_voxels_has_no_more_than_its_grid, 0, 3);
 	tcase_add_loop_test(decision, iterations_settle_where_there_are_edges_within_voxels, 0, 3);
 	tcase_add_test(decision, the_change_of_late_iterations_falls_the_earlier_the_finer_the_pixels);
@@ -355,9 +430,12 @@ Suite *averaging_suite(void)
 	tcase_add_test(decision, without_structure_nothing_is_decided);
 	tcase_add_loop_test(decision, iterations_of_a_skull_on_coarse_voxels_are_no_worse_than_fdk, 0,
 			    sizeof(skulls) / sizeof(skulls[0]));
+	tcase_add_test(edges, fdk_s_blur_is_known_beside_a_voxel_s);
+	tcase_add_loop_test(edges, edges_that_fdk_shows_as_well_are_the_mean_of_both, 0, 2);
 	tcase_add_test(decision, the_default_averages_what_is_not_made_of_voxels);
 	tcase_add_test(decision, the_default_s_mean_has_the_variance_that_it_is_asked_for);
 	tcase_add_test(decision, the_mean_is_narrower_where_tv_has_explicit_numbers);
 	suite_add_tcase(suite, decision);
+	suite_add_tcase(suite, edges);
 	return suite;
 }
