@@ -630,7 +630,7 @@ def one_round(choose, mode, world, expected, audit):
     copy(world.directory, state)
     starts = 2 if mode == "up" else 1
     seen_all = []
-    what = None
+    what = ("", "nothing", "")
     told = False
     unanswered.clear()
     posted.clear()
