@@ -2193,8 +2193,11 @@ static void errors_by_radius(const float *volume, const float *whole, const stru
 		ret[k] /= (double)count[k];
 }
 
-/* The errors in HU that the warning tells, in the inner 60 % of a field of view of this radius in mm and at its rim. */
-static void uncertain_by(const struct outcome *outcome, double radius, double ret[2])
+/*
+ * The errors in HU that the warning tells, in the inner 60 % of a field of view of this radius in mm, at its rim, and
+ * there where bone is cut.
+ */
+static void uncertain_by(const struct outcome *outcome, double radius, double ret[3])
 {
 	const char *at = strstr(outcome->warnings, "by up to ");
 	double inner, rim;
@@ -2203,9 +2206,9 @@ static void uncertain_by(const struct outcome *outcome, double radius, double re
 	ck_assert_msg(at != NULL, "%s", outcome->warnings);
 	ck_assert_int_eq(sscanf(at,
 				": by up to %lf HU within %lf mm of its axis, and from there outwards by more, up "
-				"to %lf HU at its rim, at %lf mm",
-				&ret[0], &inner, &ret[1], &rim),
-			 4);
+				"to %lf HU at its rim, at %lf mm, or %lf HU where bone is cut",
+				&ret[0], &inner, &ret[1], &rim, &ret[2]),
+			 5);
 	ck_assert_double_le(fabs(inner - 0.6 * radius), 1);
 	ck_assert_double_le(fabs(rim - radius), 1);
 }
@@ -2227,7 +2230,7 @@ START_TEST(rows_cut_in_bone_or_soft_tissue_keep_the_field_of_view)
 	struct recipe recipe = recipe_on(&grid);
 	struct outcome cut = {0}, off = {0}, whole = {0};
 	struct scene scene;
-	double errors[3], errors_off[3], told[2];
+	double errors[3], errors_off[3], told[3];
 
 	recipe.fdk.on = true;
 	scene_orbit(&scene, &spec);
@@ -2255,6 +2258,39 @@ START_TEST(rows_cut_in_bone_or_soft_tissue_keep_the_field_of_view)
 		ck_assert_msg(fabs(errors[k]) <= told[k / 2], "%s: %.1f %.1f %.1f HU; told %.0f and %.0f",
 			      cuts[_i].what, errors[0], errors[1], errors[2], told[0], told[1]);
 	outcome_clear(&off);
+	outcome_clear(&whole);
+	outcome_clear(&cut);
+	scene_clear(&scene);
+}
+END_TEST
+
+/* Where the detector ends a column outwards of the bone's inner side nothing tells how thick the bone is. */
+START_TEST(the_warning_tells_how_wrong_bone_at_the_rim_is)
+{
+	static const struct ellipse thin[2][ELLIPSES_MOST] = {BONE(66.75, 66.75, 4, 2.5, 0, 0),
+							      BONE(68.75, 68.75, 6, 2, 0, 0)};
+	const double radius = 64.5, pixel = 1100 * tan(asin(radius / 620)) / 48, voxel = 2 * radius / 72;
+	struct orbit_spec spec = {96, 1, 180, {620, 1100, {pixel, pixel}, {0, 0}, {0, 0}}, 0, 2};
+	struct grid grid = grid_of(72, 72, 1, voxel, voxel, voxel);
+	struct recipe recipe = recipe_on(&grid);
+	struct outcome cut = {0}, whole = {0};
+	struct scene scene;
+	double errors[3], told[3];
+
+	recipe.fdk.on = true;
+	scene_orbit(&scene, &spec);
+	add_ellipses(&scene, thin[_i]);
+	run(&scene, &recipe, &cut);
+	uncertain_by(&cut, radius, told);
+	scene_clear(&scene);
+	spec.columns = 3 * 96;
+	scene_orbit(&scene, &spec);
+	add_ellipses(&scene, thin[_i]);
+	run(&scene, &recipe, &whole);
+	errors_by_radius(cut.last, whole.last, &grid, radius, errors);
+	ck_assert_msg(fabs(errors[0]) <= told[0] && fabs(errors[1]) <= told[0] && fabs(errors[2]) <= told[2],
+		      "%.1f %.1f %.1f HU; told %.0f, and %.0f in bone", errors[0], errors[1], errors[2], told[0],
+		      told[2]);
 	outcome_clear(&whole);
 	outcome_clear(&cut);
 	scene_clear(&scene);
@@ -2396,6 +2432,7 @@ Suite *recon_suite(void)
 	tcase_add_loop_test(truncation, a_body_that_is_wholly_seen_is_not_called_cut_off, 0, COUNT(whole));
 	tcase_add_loop_test(truncation, sart_alone_tells_of_truncation, 0, 2);
 	tcase_add_loop_test(truncation, rows_cut_in_bone_or_soft_tissue_keep_the_field_of_view, 0, CUTS);
+	tcase_add_loop_test(truncation, the_warning_tells_how_wrong_bone_at_the_rim_is, 0, 2);
 	tcase_add_test(truncation, a_truncated_abdomen_keeps_its_values);
 	suite_add_tcase(suite, truncation);
 
