@@ -100,19 +100,6 @@ static void to_world(const struct path *path, double axes[3][3], const double nu
 	}
 }
 
-void path_motion(const struct path *path, double at, const struct view *view, double ret_motion[PATH_NUMBERS])
-{
-	double numbers[PATH_NUMBERS], axes[3][3];
-
-	path_at(path, at, numbers);
-	view_axes(view, axes);
-	to_world(path, axes, numbers, ret_motion);
-	for (int i = 0; i < PATH_NUMBERS; i++)
-		ret_motion[i] += path->common[i];
-	for (int i = 3; i < PATH_NUMBERS; i++)
-		ret_motion[i] *= PATH_TURN_UNIT;
-}
-
 /* Turns x back about the vector `turn` by its length (Rodrigues 1840). */
 static void turn_back(const double turn[3], const double x[3], double ret[3])
 {
@@ -124,6 +111,46 @@ static void turn_back(const double turn[3], const double x[3], double ret[3])
 	vec_cross(turn, once, twice);
 	for (int a = 0; a < 3; a++)
 		ret[a] = x[a] + s * once[a] + c * twice[a];
+}
+
+/* Turns one behind another: the vector of rotation that both together are (Rodrigues 1840). */
+static void turn_both(const double last[3], const double first[3], double ret[3])
+{
+	double parts[2][4], axis[3], sine, cosine, length;
+
+	for (int i = 0; i < 2; i++) {
+		const double *turn = i == 0 ? last : first, angle = vec_norm(turn);
+
+		parts[i][3] = cos(angle / 2);
+		for (int a = 0; a < 3; a++)
+			parts[i][a] = (angle > 0 ? sin(angle / 2) / angle : 0.5) * turn[a];
+	}
+	vec_cross(parts[0], parts[1], axis);
+	for (int a = 0; a < 3; a++)
+		axis[a] += parts[0][3] * parts[1][a] + parts[1][3] * parts[0][a];
+	cosine = parts[0][3] * parts[1][3] - vec_dot(parts[0], parts[1]);
+	sine = vec_norm(axis);
+	length = sine > 0 ? 2 * atan2(sine, cosine) / sine : 2;
+	for (int a = 0; a < 3; a++)
+		ret[a] = length * axis[a];
+}
+
+void path_motion(const struct path *path, double at, const struct view *view, double ret_motion[PATH_NUMBERS])
+{
+	double numbers[PATH_NUMBERS], axes[3][3], world[PATH_NUMBERS], back[3], common[3], shift[3];
+
+	path_at(path, at, numbers);
+	view_axes(view, axes);
+	to_world(path, axes, numbers, world);
+	for (int a = 0; a < 3; a++) {
+		world[3 + a] *= PATH_TURN_UNIT;
+		back[a] = -world[3 + a];
+		common[a] = path->common[3 + a] * PATH_TURN_UNIT;
+	}
+	turn_back(back, path->common, shift);
+	for (int a = 0; a < 3; a++)
+		ret_motion[a] = world[a] + shift[a];
+	turn_both(world + 3, common, ret_motion + 3);
 }
 
 struct view view_of_moved(const struct view *view, const double motion[PATH_NUMBERS])

@@ -25,8 +25,8 @@ struct path {
 	int knots;
 	double numbers[PATH_KNOTS_MOST][PATH_NUMBERS];
 	/*
-	 * With of_views: a motion that all views share, along and about x, y and z. What the numbers are expected to be
-	 * says nothing of where the object lies, so that a step finds both.
+	 * A motion that all views share, before the path's own, along and about x, y and z. What the numbers are
+	 * expected to be says nothing of where the object lies, so that with of_views a step finds both.
 	 */
 	double common[PATH_NUMBERS];
 };

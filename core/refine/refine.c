@@ -6,6 +6,7 @@
 #include <string.h>
 
 #include "core/refine/registration.h"
+#include "core/refine/rest.h"
 
 enum { VIEWS_LEAST = 48, BINS_LEAST = 24, LEVELS = 2, BINS_COARSE = REFINE_BINS_MOST / 2 };
 static const double ARC_LEAST = 2.8;   /* radians */
@@ -518,6 +519,15 @@ static void judge(const struct run *run, const struct registration *fit)
 			       (!fit->referred || refinement->alike > ALIKE_LEAST);
 }
 
+/* Without a reference nothing says where the object lies: it is shown where the told geometry has it. */
+static int let_rest(const struct registration *fit, int bins, struct refinement *refinement, struct error *err)
+{
+	struct grid shown;
+
+	orbit_covering_grid(&fit->orbit, &fit->reduced->geometry, bins, &shown);
+	return path_rest(&refinement->path, fit->views, fit->geometry.count, &shown, err);
+}
+
 static int run_level(struct run *run, const struct registration_options *options, const struct schedule *schedule,
 		     bool last, struct error *err)
 {
@@ -530,8 +540,11 @@ static int run_level(struct run *run, const struct registration_options *options
 	if (fit.held_count == 0 || fit.used_count < (fit.referred ? VIEWS_LEAST / 3 : VIEWS_LEAST / 2))
 		goto out;
 	code = fit.referred ? run_referred(run, &fit, schedule, err) : run_alone(run, &fit, schedule, last, err);
-	if (code == 0 && is_caught_up(run) && last)
+	if (code == 0 && is_caught_up(run) && last) {
 		judge(run, &fit);
+		if (!fit.referred && fit.kind == REFINE_GEOMETRY)
+			code = let_rest(&fit, options->bins, run->refinement, err);
+	}
 out:
 	registration_clear(&fit);
 	return code;

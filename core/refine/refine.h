@@ -33,8 +33,10 @@
  * held out do not show is of another object, and is not followed; nor is one by whose path the scan contradicts itself:
  * views that are held out then agree worse with a volume of the scan's own others than they do as the scan has them.
  *
- * Without a reference what all views share is no motion. Nor does a scan tell how large the object is: the way along
- * the beam is expected to be small. Bins limit what can be found, to about a thirtieth of one.
+ * Without a reference what all views share is no motion: a refined geometry has the object, on the whole, where the
+ * told one has it (core/refine/rest.h), aside of the truth by what the departures of all views share; and an object
+ * that moved lies in the mean place of its path over the views. Nor does a scan tell how large the object is: the way
+ * along the beam is expected to be small. Bins limit what can be found, to about a thirtieth of one.
  */
 enum { REFINE_VIEWS_MOST = 120, REFINE_BINS_MOST = 160 };
 

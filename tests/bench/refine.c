@@ -3,11 +3,11 @@
  * nods: bodies with exact line integrals (tests/bench/bodies.h), given with the circle's geometry. For each scan the
  * mean distance between where points lie and where the geometry says, in mm at the isocentre, before and after, and the
  * FDK volume's root mean square error within the body, HU. Both are taken where the geometry fits the truth best as a
- * whole: no scan tells where the object lay. `make bench-refine` builds and runs it; tests/bench/results/refine.txt has
- * its table. Arguments: pixels along a row, views, degrees, first seed, seeds, first departure, the one behind the
- * last, the only body (0: head, 1: abdomen, 2: knee; -1: all), the most voxels along a side of the FDK volume, and the
- * backend that refines and makes that volume. Where that is not the CPU's the CPU's refines, too, and how far apart the
- * two put points is told in mm at the isocentre.
+ * whole, for no scan tells where the object lay; HU also where each geometry has it: "said" and "lies". `make
+ * bench-refine` builds and runs it; tests/bench/results/refine.txt has its table. Arguments: pixels along a row, views,
+ * degrees, first seed, seeds, first departure, the one behind the last, the only body (0: head, 1: abdomen, 2: knee;
+ * -1: all), the most voxels along a side of the FDK volume, and the backend that refines and makes that volume. Where
+ * that is not the CPU's the CPU's refines, too, and how far apart the two put points is told in mm at the isocentre.
  */
 #include <math.h>
 #include <stdio.h>
@@ -331,7 +331,7 @@ static int measure(const struct departure *departure, enum kind kind, int seed, 
 	struct scan scan;
 	struct geometry refined = {0}, beside = {0};
 	struct refinement refinement, other;
-	double mm[2], hu[4], motion[2][PATH_NUMBERS], seconds[2] = {0}, cpu_seconds[2] = {0};
+	double mm[2], hu[5], motion[2][PATH_NUMBERS], seconds[2] = {0}, cpu_seconds[2] = {0};
 	int code = open_scan(&scan, departure, kind, seed, columns, count, arc, err);
 
 	if (code == 0 && referred)
@@ -355,9 +355,12 @@ static int measure(const struct departure *departure, enum kind kind, int seed, 
 	if (code == 0)
 		code = body_error(backend, &scan, &refined, motion[1], voxels, &hu[3], err);
 	if (code == 0)
-		printf("%-26s %-18s %3d  %5.0f %6.1f %6.1f %6.1f %6.1f  %6.3f %6.3f  %-4s %5.2f %% %3d/%2d %5d %7.1f "
+		code = body_error(backend, &scan, &refined, still, voxels, &hu[4], err);
+	if (code == 0)
+		printf("%-26s %-18s %3d  %5.0f %6.1f %6.1f %6.1f %6.1f %6.1f  %6.3f %6.3f  %-4s %5.2f %% %3d/%2d %5d "
+		       "%7.1f "
 		       "%6.1f\n",
-		       departure->name, kind_names[kind], seed, arc, hu[0], hu[1], hu[2], hu[3], mm[0], mm[1],
+		       departure->name, kind_names[kind], seed, arc, hu[0], hu[1], hu[2], hu[3], hu[4], mm[0], mm[1],
 		       refinement.accepted ? "yes" : "no", 100 * (1 - refinement.held_after / refinement.held_before),
 		       refinement.better, refinement.held_out, refinement.path.knots, seconds[0], seconds[1]);
 	if (code == 0 && referred)
@@ -392,9 +395,9 @@ int main(int argc, char **argv)
 		fprintf(stderr, "no backend %s\n", argv[10]);
 		return EXIT_FAILURE;
 	}
-	printf("%-26s %-18s %3s  %5s %6s %6s %6s %6s  %6s %6s  %-4s %7s %6s %5s %7s %6s\n", "departure", "body", "",
-	       "arc", "true", "said", "whole", "after", "mm", "after", "kept", "better", "views", "knots", "seconds",
-	       "wall");
+	printf("%-26s %-18s %3s  %5s %6s %6s %6s %6s %6s  %6s %6s  %-4s %7s %6s %5s %7s %6s\n", "departure", "body", "",
+	       "arc", "true", "said", "whole", "after", "lies", "mm", "after", "kept", "better", "views", "knots",
+	       "seconds", "wall");
 	fflush(stdout);
 	for (int d = from; d < to && d < DEPARTURES; d++)
 		for (int kind = body; kind < bodies; kind++)

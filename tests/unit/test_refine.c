@@ -15,6 +15,7 @@
 #include "core/fit/least_squares.h"
 #include "core/outofcore/outofcore.h"
 #include "core/refine/refine.h"
+#include "core/refine/rest.h"
 #include "core/scan/phantom.h"
 #include "tests/unit/arm.h"
 #include "tests/unit/scene.h"
@@ -341,12 +342,82 @@ static double distance(const struct geometry *truth, const struct geometry *said
 	return sqrt(2 * rms);
 }
 
+/* ---- where the object is shown ---- */
+
+/* A path and the views that it moves. */
+struct resting {
+	struct path path;
+	struct path_view views[VIEWS];
+	struct geometry said, before, after;
+};
+
+static void move_all(const struct resting *resting, struct geometry *geometry)
+{
+	for (int v = 0; v < VIEWS; v++) {
+		double motion[PATH_NUMBERS];
+
+		path_motion(&resting->path, resting->views[v].at, &resting->said.views[v], motion);
+		geometry->views[v] = view_of_moved(&resting->said.views[v], motion);
+	}
+}
+
+/* Rests. Free with clear_rest. */
+static void let_rest(struct resting *resting)
+{
+	static const struct grid shown = {.size = {60, 60, 50}, .spacing = {3, 3, 3}, .origin = {-88.5, -88.5, -73.5}};
+	const struct arm arm = {.columns = COLUMNS, .rows = ROWS, .count = VIEWS, .pixel = PIXEL, .step = .06};
+	struct error err;
+
+	ck_assert_int_eq(arm_nominal_geometry(&arm, &resting->said, &err), 0);
+	ck_assert_int_eq(geometry_copy(&resting->before, &resting->said, &err), 0);
+	ck_assert_int_eq(geometry_copy(&resting->after, &resting->said, &err), 0);
+	for (int v = 0; v < VIEWS; v++)
+		resting->views[v] = (struct path_view){.at = .06 * v, .view = resting->said.views[v]};
+	move_all(resting, &resting->before);
+	ck_assert_int_eq(path_rest(&resting->path, resting->views, VIEWS, &shown, &err), 0);
+	move_all(resting, &resting->after);
+	/* Seen from the object the views stand to each other as they did. */
+	ck_assert_double_lt(distance(&resting->before, &resting->after, false, 0), 1e-6);
+}
+
+static void clear_rest(struct resting *resting)
+{
+	geometry_clear(&resting->said);
+	geometry_clear(&resting->before);
+	geometry_clear(&resting->after);
+}
+
+/* What the views of a refined geometry share is taken off, so that they have the object where the told ones do. */
+START_TEST(a_geometry_shows_the_object_where_it_was_told)
+{
+	static const double common[PATH_NUMBERS] = {2, -1, 1.5, 1, -2, .5};
+	struct resting resting;
+	double before, after, least;
+
+	path_open(&resting.path, true, .06 * (VIEWS - 1), 9);
+	memcpy(resting.path.common, common, sizeof(common));
+	for (int k = 0; k < resting.path.knots; k++)
+		for (int i = 0; i < PATH_NUMBERS; i++)
+			resting.path.numbers[k][i] = .3 * cos(3 * k + 2 * i);
+	let_rest(&resting);
+	before = distance(&resting.said, &resting.before, true, 0);
+	after = distance(&resting.said, &resting.after, true, 0);
+	least = distance(&resting.said, &resting.after, false, 0);
+	ck_assert_double_gt(before, 2);
+	ck_assert_msg(after < 1.1 * least, "%g mm, %g in the best place", after, least);
+	clear_rest(&resting);
+}
+END_TEST
+
+/* ---- what is found of a scan ---- */
+
 struct found {
 	struct refinement refinement;
-	double before, after; /* mm */
+	double before, after; /* mm, in the best place, */
+	double told, lies;    /* and where the told and the refined views have it */
 	double share;         /* of the work, as it was told last */
 	double largest;       /* step of it */
-	int told;             /* how often it was */
+	int shares;           /* how often it was */
 };
 
 /* What is told of the work grows with each step. */
@@ -357,11 +428,12 @@ static void note_share(void *context, double share)
 	ck_assert_double_gt(share, found->share);
 	found->largest = fmax(found->largest, share - found->share);
 	found->share = share;
-	found->told++;
+	found->shares++;
 }
 
 struct taken {
 	double sway; /* mm, of the detector along its columns and rows, that no common motion explains */
+	double sag;  /* of the arm */
 	double nod;  /* radians, of the head, or of the knee */
 	bool knee;
 	int views;
@@ -379,12 +451,13 @@ static struct found find_on(const struct refine_device *on, const struct taken *
 				.count = views,
 				.pixel = PIXEL,
 				.first = .2,
+				.sag = taken->sag,
 				.step = taken->displaced ? 2 * M_PI / views : 3.5 / (views - 1)};
 	float *projections = malloc(sizeof(float) * VIEWS * COLUMNS * ROWS);
 	struct geometry said, truth, refined;
 	struct reduced reduced;
 	struct orbit orbit;
-	struct found found = {.told = 0};
+	struct found found = {.shares = 0};
 	const struct refine_watch watch = {.progress = note_share, .context = &found};
 	struct error err;
 
@@ -396,6 +469,8 @@ static struct found find_on(const struct refine_device *on, const struct taken *
 		const double motion[PATH_NUMBERS] = {0, 0, 0, taken->nod * tanh(8 * (share - .5)), 0, 0};
 		struct view *view = &truth.views[k];
 
+		if (taken->sag > 0)
+			*view = arm_view(&arm, k);
 		for (int a = 0; a < 3 && taken->displaced; a++) {
 			view->pixel0[a] += .3 * COLUMNS * view->column_step[a];
 			said.views[k].pixel0[a] = view->pixel0[a];
@@ -423,9 +498,11 @@ static struct found find_on(const struct refine_device *on, const struct taken *
 	}
 	ck_assert_double_eq_tol(found.share, 1, 1e-12);
 	ck_assert_double_lt(found.largest, referred ? .3 : .1);
-	ck_assert_int_gt(found.told, referred ? 7 : 30);
+	ck_assert_int_gt(found.shares, referred ? 7 : 30);
 	found.before = distance(&truth, &said, referred, taken->aside);
 	found.after = distance(&truth, &refined, referred, taken->aside);
+	found.told = distance(&truth, &said, true, taken->aside);
+	found.lies = distance(&truth, &refined, true, taken->aside);
 	reduced_clear(&reduced);
 	orbit_clear(&orbit);
 	geometry_clear(&said);
@@ -456,6 +533,19 @@ START_TEST(a_detector_that_sways_is_found)
 	ck_assert_int_eq(found.refinement.held_out, VIEWS / 8);
 	ck_assert_double_lt(found.refinement.held_after, found.refinement.held_before);
 	ck_assert_msg(found.after < .5 * found.before, "%g mm of %g", found.after, found.before);
+}
+END_TEST
+
+/* What all views share of a sag is not known, and stays; no other is put in its place. */
+START_TEST(a_head_under_an_arm_that_sags_stays_where_it_is)
+{
+	const struct found found = find(&(struct taken){.sag = .5, .views = VIEWS});
+
+	ck_assert(found.refinement.accepted);
+	ck_assert_msg(found.after < .6 * found.before, "%g mm of %g", found.after, found.before);
+	ck_assert_msg(found.lies < found.told, "%g mm aside, %g as told", found.lies, found.told);
+	ck_assert_double_eq_tol(sqrt(found.lies * found.lies - found.after * found.after),
+				sqrt(found.told * found.told - found.before * found.before), .05);
 }
 END_TEST
 
@@ -884,11 +974,13 @@ Suite *refine_suite(void)
 	tcase_add_test(paths, more_knots_do_not_change_a_path);
 	tcase_add_loop_test(paths, a_step_finds_what_made_the_residuals, 0, 2);
 	tcase_add_test(paths, what_all_views_share_is_no_path);
+	tcase_add_test(paths, a_geometry_shows_the_object_where_it_was_told);
 	tcase_add_test(paths, halved_bins_are_those_of_larger_ones);
 	tcase_add_test(paths, a_displaced_detector_needs_a_reference);
 	suite_add_tcase(suite, paths);
 	tcase_set_timeout(scans, 300);
 	tcase_add_test(scans, a_detector_that_sways_is_found);
+	tcase_add_test(scans, a_head_under_an_arm_that_sags_stays_where_it_is);
 	tcase_add_test(scans, a_head_that_nods_is_followed);
 	tcase_add_test(scans, a_knee_that_nods_is_followed);
 	tcase_add_test(scans, a_geometry_that_fits_is_left_alone);
