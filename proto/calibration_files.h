@@ -7,7 +7,8 @@
  * The directory of one of the daemon's calibrations:
  *
  *   request.json  {"scan": id, "arm", "phantom": {...}, "adjust_balls", "created", "acquired": seconds since
- *                 1970, "sweep": the document of the scan}: what to do, written by the daemon
+ *                 1970, "sweep": the document of the scan}: what to do, written by the daemon; and again, with
+ *                 "made": true, once there is a result
  *   result.json   {"ended", "error": null} and the members of calibration_json; or
  *                 {"ended", "error": {"code": enum error_code, "detail", "pointer"}}: written by cbct-worker
  *
@@ -15,10 +16,11 @@
  * and the result "geometry" alone: the daemon writes both.
  *
  * Request and result end with their checksums (proto/seal.h). A directory without a result is a calibration that is
- * still to be made.
+ * still to be made, or a damaged one where the request says that it was.
  */
 #define CALIBRATION_REQUEST "request.json"
 #define CALIBRATION_RESULT "result.json"
+#define CALIBRATION_MADE "made"
 
 /* Whole or not at all, as file_write_durable. */
 int sealed_write(const char *path, const cJSON *document, struct error *err);

@@ -43,6 +43,8 @@ struct calibrations {
 void calibration_path(const struct calibrations *calibrations, const char *id, const char *file, char ret_path[1024]);
 /* NULL where there is none; the lock is held. */
 struct entry *calibration_entry(struct calibrations *calibrations, const char *id);
+
+/* ---- read.c ---- */
 /*
  * Reads request and result; of one that has not succeeded the result is NULL where there is none. ERR_DAMAGED: also a
  * file that is gone; ERR_NOT_FOUND: so is the calibration, or it is not in the list yet.
@@ -50,7 +52,10 @@ struct entry *calibration_entry(struct calibrations *calibrations, const char *i
 int calibration_read(struct calibrations *calibrations, const char *id, bool succeeded, cJSON **ret_request,
 		     cJSON **ret_result, struct error *err);
 
-/* An entry from the files of a calibration; brief is the caller's. */
+/*
+ * An entry from the files of a calibration, whose request says from now on that there is a result, where there is one.
+ * ERR_DAMAGED: also where it says so and there is none. brief is the caller's.
+ */
 int calibration_load(struct calibrations *calibrations, const char *id, struct entry *ret_entry, struct error *err);
 
 /* ---- document.c ---- */

@@ -10,6 +10,7 @@
 #include <unistd.h>
 
 #include "daemon/calibrations/internal.h"
+#include "daemon/files.h"
 #include "daemon/log.h"
 #include "proto/clock.h"
 
@@ -93,7 +94,7 @@ static void settle(struct calibrations *calibrations, const char *id, int code, 
 {
 	cJSON *request = NULL, *result = NULL;
 	struct entry *entry, loaded = {0};
-	struct error failure = *why;
+	struct error failure = *why, shown;
 
 	if (unwanted(calibrations, id))
 		return;
@@ -106,7 +107,9 @@ static void settle(struct calibrations *calibrations, const char *id, int code, 
 	}
 	if (code != 0 && calibration_read(calibrations, id, false, &request, &result, &failure) == 0) {
 		loaded.state = CALIBRATION_FAILED;
-		loaded.brief = calibration_brief(id, request, NULL, &failure);
+		shown = failure; /* clients do not see paths, the log does */
+		path_hide(shown.text, store_directory(calibrations->store));
+		loaded.brief = calibration_brief(id, request, NULL, &shown);
 	}
 	cJSON_Delete(request);
 	cJSON_Delete(result);

@@ -293,6 +293,59 @@ test_calibrations_outlive_crashes_and_damage_is_told() {
 	stop_daemon
 }
 
+# What somebody was told of is not made again without a word. One of a version that did not note it is noted at the start.
+test_a_result_that_is_lost_while_the_daemon_is_down_is_told() {
+	local case lost
+	rm -rf "$state"
+	printf '#!/bin/sh\n[ "$1" != --calibrate ] || cp "$2/request.json" "%s"\nexec "%s" "$@"\n' "$work/posted.json" "$BUILD/cbct-worker" >"$work/copies"
+	chmod +x "$work/copies"
+	for case in succeeded older failed; do
+		start_daemon --worker "$work/copies"
+		balls
+		[ $case != failed ] || phantom=$(jq -c '.ball_mm = 3.6' <<<"$phantom")
+		calibrated
+		expect_json ".state == \"${case/older/succeeded}\""
+		stop_daemon KILL
+		lost=$state/calibrations/$calibration
+		if [ $case = older ]; then
+			cp "$work/posted.json" "$lost/request.json"
+			start_daemon
+			req GET "/v1/calibrations/$calibration"
+			expect_json '.state == "succeeded"'
+			stop_daemon KILL
+		fi
+		rm "$lost/result.json"
+		start_daemon
+		req GET "/v1/calibrations/$calibration?wait=60"
+		expect_status 404
+		req GET /v1/quarantine
+		jq -e --arg from "calibrations/$calibration" 'any(.entries[]; .from == $from and (.why | test("result.json is gone")))' "$body" >/dev/null ||
+			fail "$case: what was set aside: $(cat "$body")"
+		grep -q "$calibration.*result.json is gone" "$work/cbctd.err" || fail "$case: the log"
+		stop_daemon
+	done
+	phantom=$(jq -c '.ball_mm = 6' <<<"$phantom")
+}
+
+# A failure says which file is missing, not where the daemon keeps it.
+test_a_failure_shows_no_path_of_the_server() {
+	printf '#!/bin/sh\n[ "$1" != --calibrate ] || exec sleep 60\nexec "%s" "$@"\n' "$BUILD/cbct-worker" >"$work/slow"
+	chmod +x "$work/slow"
+	start_daemon --worker "$work/slow"
+	balls
+	req POST /v1/calibrations "${json[@]}" "{\"scan\": \"$balls\", \"phantom\": $phantom}"
+	calibration=$(jq -r .id "$body")
+	stop_daemon KILL
+	rm -r "$state/scans/$balls"
+	for _ in 1 2; do # as it is made, and as it is read again
+		start_daemon
+		req GET "/v1/calibrations/$calibration?wait=60"
+		jq -e --arg state "$state" '.state == "failed" and (.error.detail | contains("scan.json") and (contains($state) | not))' "$body" >/dev/null ||
+			fail "a failure: $(jq -c .error "$body")"
+		stop_daemon
+	done
+}
+
 test_cbct_and_python_calibrate() {
 	start_daemon
 	balls
