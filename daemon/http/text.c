@@ -111,6 +111,16 @@ static double parse_weight(const char *text, size_t length)
 	return weight <= 1 ? weight : -1;
 }
 
+/* "x-gzip" is "gzip" (RFC 9110, 8.4.1.3). */
+static bool is_coding(const char *name, size_t length, const char *coding)
+{
+	if (length == 6 && strncasecmp(name, "x-gzip", length) == 0) {
+		name += 2;
+		length -= 2;
+	}
+	return length == strlen(coding) && strncasecmp(name, coding, length) == 0;
+}
+
 double coding_weight(const char *header, const char *coding)
 {
 	while (*header != '\0') {
@@ -118,10 +128,12 @@ double coding_weight(const char *header, const char *coding)
 
 		header += strspn(header, " \t,");
 		length = strcspn(header, " \t,;");
-		if (length == strlen(coding) && strncasecmp(header, coding, length) == 0) {
+		if (is_coding(header, length, coding)) {
 			header = skip_blanks(header + length);
-			if (*header != ';')
+			if (*header == '\0' || *header == ',')
 				return 1;
+			if (*header != ';')
+				return -1;
 			header = skip_blanks(header + 1);
 			weight = strcspn(header, " \t,");
 			return weight > 2 && strncasecmp(header, "q=", 2) == 0 ? parse_weight(header + 2, weight - 2)

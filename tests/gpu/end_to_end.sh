@@ -148,11 +148,13 @@ if [ -x "$BUILD/cbct-worker-faulty" ]; then
 	stop
 fi
 
-# What arrives while the arm turns, in any order, and what phantoms become: the daemon's own tests.
+# What arrives while the arm turns, in any order, what phantoms become and their end slices, what is beside metal, stuck
+# pixels, rings, lag and scatter, and what a job says of its quality: the daemon's own tests.
+parts=(arriving phantom test_metal stuck_pixels rings detector quality)
 if command -v curl >/dev/null && command -v jq >/dev/null; then
-	check "the daemon's tests of arriving and phantom" env BACKEND=cuda BUILD="$BUILD" tests/run.sh arriving phantom
+	check "the daemon's tests: ${parts[*]}" env BACKEND=cuda BUILD="$BUILD" tests/run.sh "${parts[@]}"
 else
-	echo "SKIPPED: the daemon's tests of arriving and phantom need curl and jq"
+	echo "SKIPPED: the daemon's tests (${parts[*]}) need curl and jq"
 fi
 # The daemon's own tests of jobs on several devices pretend that there are cards; these are real ones.
 if [ "$(nvidia-smi -L | wc -l)" -gt 1 ] && command -v python3 >/dev/null; then

@@ -571,6 +571,15 @@ def vanished(before, state, damaged, kind, stopped):
 # ---- damage ----
 
 def damage(choose, state, under):
+    """One file of those that are there; a running daemon renames its temporary ones meanwhile."""
+    while True:
+        try:
+            return damage_one(choose, state, under)
+        except FileNotFoundError:
+            pass
+
+
+def damage_one(choose, state, under):
     files = sorted(path for path in (Path(state) / under).rglob("*") if path.is_file() and path.name not in ("lock", "reserve", "reserve-start"))
     path = choose.choice(files)
     size = path.stat().st_size

@@ -209,7 +209,7 @@ test_volumes_come_in_every_format() {
 	zstd -q -d -c <"$body" | cmp - "$work/v.nii" || fail "the same bytes through zstd"
 	etag=$(header etag)
 	# what a client would rather have
-	for coding in "zstd;q=0.5, identity" "identity;q=0.2, zstd;q=0.1" "zstd;q=0" "*" "zstd;q=0.3, *" "*;q=0" "zstd;q=nan" "zstd;q=2" "zstd;q=0.1234" "zstd;p=1"; do
+	for coding in "zstd;q=0.5, identity" "identity;q=0.2, zstd;q=0.1" "zstd;q=0" "*" "zstd;q=0.3, *" "*;q=0" "zstd;q=nan" "zstd;q=2" "zstd;q=0.1234" "zstd;p=1" "zstd q=1"; do
 		req GET "/v1/jobs/$job/volumes/final" -H "Accept-Encoding: $coding"
 		[ -z "$(header content-encoding)" ] || fail "plain bytes for $coding"
 		cmp "$body" "$work/v.nii" || fail "the plain bytes for $coding"

@@ -82,7 +82,7 @@ test_images_are_taken_off_whatever_the_order_of_arrival() {
 	req GET "/v1/jobs/$job/volumes/final/provenance"
 	expect_json '.images.scatter | startswith("sha-256=:")'
 	# in one process, without a daemon
-	cbct recon "$work/images" -o "$work/alone" --fdk hann --grid 40,40,28 --spacing 2.6 --quiet >"$work/said" 2>&1 || fail "cbct recon: $(cat "$work/said")"
+	cbct recon "$work/images" -o "$work/alone" --backend "$BACKEND" --fdk hann --grid 40,40,28 --spacing 2.6 --quiet >"$work/said" 2>&1 || fail "cbct recon: $(cat "$work/said")"
 	cbct compare --json "$work/alone/final.nii" "$work/volume.nii" | jq -e '.rmse == 0' >/dev/null || fail "the same volume by cbct recon"
 	# The job first, projections from the last to the first, and scatter amid them and behind them.
 	post_scan "$work/images"

@@ -44,6 +44,8 @@ test_files_are_compressed_and_kept() {
 	[[ $(header content-security-policy) == "default-src 'none'; script-src 'self';"* ]] || fail "a strict policy"
 	[[ $(header content-security-policy) != *unsafe* ]] || fail "nothing unsafe in it"
 	gzip -dc <"$body" >"$work/index.html"
+	req GET / -H 'Accept-Encoding: identity;q=0, X-Gzip'
+	[ "$(header content-encoding)" = gzip ] || fail "gzip by its old name"
 	req GET /
 	cmp "$body" "$work/index.html" || fail "the same page without gzip"
 	etag=$(header etag)
