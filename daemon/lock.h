@@ -17,6 +17,7 @@ enum lock_rank {
 	LOCK_INSERTION,  /* store.insertion_lock */
 	LOCK_CATALOGUE,  /* catalogue.locks[] */
 	LOCK_SCATTER,    /* stored_scan.scatter_files */
+	LOCK_RECORDS,    /* stored_scan.records */
 	LOCK_SCANS,      /* store.scans_lock */
 	LOCK_SCAN,       /* stored_scan.lock */
 	LOCK_JOBS,       /* jobs.lock */

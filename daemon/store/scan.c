@@ -42,6 +42,7 @@ struct stored_scan *stored_scan_free(struct stored_scan *scan)
 	watch_list_destroy(&scan->watchers);
 	pthread_mutex_destroy(&scan->lock);
 	pthread_mutex_destroy(&scan->scatter_files);
+	pthread_mutex_destroy(&scan->records);
 	free(scan);
 	return NULL;
 }
@@ -54,6 +55,7 @@ struct stored_scan *stored_scan_new(struct store *store, int count)
 		return NULL;
 	lock_init(&scan->lock, LOCK_SCAN);
 	lock_init(&scan->scatter_files, LOCK_SCATTER);
+	lock_init(&scan->records, LOCK_RECORDS);
 	watch_list_init(&scan->watchers);
 	scan->store = store;
 	scan->count = count;
@@ -429,7 +431,7 @@ static void mark_finished(const struct store *store, const char *id)
 	unlink(path); /* else at the next start: beside a record it says nothing */
 }
 
-static int make_files(struct store *store, const struct scan *parsed, const struct stored_scan *scan, struct error *err)
+static int make_files(struct store *store, const struct scan *parsed, struct stored_scan *scan, struct error *err)
 {
 	unsigned long long bytes =
 	    (unsigned long long)scan_projection_bytes(parsed) * (unsigned long long)parsed->count;

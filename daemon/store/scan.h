@@ -29,6 +29,8 @@ struct stored_scan {
 	bool has_room; /* on the disk, for all projections, or is just given it: what limits count */
 	bool removed;  /* from the array: whoever refers to it now may use its parsed form */
 
+	pthread_mutex_t records; /* held over the opening of projections.sums, and over its mend */
+
 	pthread_mutex_t lock;    /* guards what follows */
 	bool room;               /* the disk has it, and no projection needs to ask for it */
 	bool returning;          /* the room is being given back: nobody gets a claim meanwhile */
@@ -94,8 +96,8 @@ size_t stored_image_bytes(const struct stored_scan *scan, enum image image);
 
 /* With the scan's lock held: projection `index` is not on the disk any more, and lost. */
 void stored_scan_remove(struct stored_scan *scan, int index);
-/* A descriptor of projections.sums, for writing; *ret_whole: no record of it is damaged. */
-int stored_scan_open_records(const struct stored_scan *scan, bool *ret_whole, int *ret_file, struct error *err);
+/* A descriptor of projections.sums as it is, for writing; *ret_whole: the file has its size and its line. */
+int stored_scan_find_sums(const struct stored_scan *scan, bool *ret_whole, int *ret_file, struct error *err);
 /* With the scan's lock held: projection `index` is on the disk, with its row. */
 void stored_scan_add(struct stored_scan *scan, int index, const struct sum *sum);
 
@@ -105,6 +107,11 @@ void stored_scan_add(struct stored_scan *scan, int index, const struct sum *sum)
  * SHA-256 only. A file that is missing, short or has a damaged line is made again from the records that are good.
  */
 int store_load_sums(struct store *store, struct stored_scan *scan, struct error *err);
+/*
+ * With scan->records locked: projections.sums anew, from memory, which has what was acknowledged. All of the scan's
+ * files are checked then: that gives its parts their records.
+ */
+int store_make_sums(struct stored_scan *scan, struct error *err);
 
 /*
  * Images of scatter, store/scatter.c: their lists in memory; their files; what is there, from their records, where
@@ -139,10 +146,9 @@ int stored_scan_set_image(const struct stored_scan *scan, enum image image, cons
 int stored_scan_set_closed(const struct stored_scan *scan, struct error *err);
 
 /* The record of a part of the scan directory, synced: behind its file and before its row. bytes NULL: it has none. */
-int store_put_part_sum(const struct stored_scan *scan, int part, const void *bytes, size_t size, struct error *err);
+int store_put_part_sum(struct stored_scan *scan, int part, const void *bytes, size_t size, struct error *err);
 /* ERR_DAMAGED: these bytes do not fit the part's record. One without a record is taken as it is. */
-int store_check_part(const struct stored_scan *scan, enum sums_part part, const void *bytes, size_t size,
-		     struct error *err);
+int store_check_part(struct stored_scan *scan, enum sums_part part, const void *bytes, size_t size, struct error *err);
 /* A stored image is read; ERR_DAMAGED: it does not fit its SHA-256, and is lost now. */
 int store_check_image(struct stored_scan *scan, enum image image, struct error *err);
 /* ERR_QUOTA when an image that is being written goes beyond a limit of bytes. */

@@ -348,9 +348,12 @@ int stored_scan_take_room(struct stored_scan *scan, int descriptor, struct error
  */
 bool stored_scan_return_room(struct stored_scan *scan, int descriptor);
 
-/* A descriptor of projections.raw, the caller's to close; close-on-exec. */
+/*
+ * A descriptor of projections.raw, the caller's to close; close-on-exec. A file that went while the daemon ran is made
+ * anew, and the scan checked: its projections are lost.
+ */
 int stored_scan_open(struct stored_scan *scan, bool writing, int *ret_descriptor, struct error *err);
-/* The same of projections.sums, for writing. */
+/* The same of projections.sums, for writing; made anew from memory, where it went or is not whole: nothing is lost. */
 int stored_scan_open_sums(struct stored_scan *scan, int *ret_descriptor, struct error *err);
 
 /*

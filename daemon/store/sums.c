@@ -25,22 +25,25 @@ size_t stored_scan_bytes(const struct stored_scan *scan)
 	return (size_t)scan->columns * (size_t)scan->rows * sample_bytes(scan->sample);
 }
 
-int stored_scan_open_records(const struct stored_scan *scan, bool *ret_whole, int *ret_file, struct error *err)
+int stored_scan_open_sums(struct stored_scan *scan, int *ret_descriptor, struct error *err)
 {
-	char directory[1024];
+	bool whole = false;
+	int code;
 
-	store_scan_directory(scan->store, scan->id, directory);
-	return sums_open(directory, true, scan->count, stored_scan_bytes(scan), ret_file, ret_whole, err);
+	pthread_mutex_lock(&scan->records);
+	code = stored_scan_find_sums(scan, &whole, ret_descriptor, err);
+	if ((code == ERR_NOT_FOUND || (code == 0 && !whole)) && !scan->gone && !stored_scan_deleted(scan)) {
+		if (code == 0)
+			close(*ret_descriptor);
+		code = store_make_sums(scan, err);
+		if (code == 0)
+			code = stored_scan_find_sums(scan, &whole, ret_descriptor, err);
+	}
+	pthread_mutex_unlock(&scan->records);
+	return code;
 }
 
 /* ---- writing ---- */
-
-int stored_scan_open_sums(struct stored_scan *scan, int *ret_descriptor, struct error *err)
-{
-	bool whole;
-
-	return stored_scan_open_records(scan, &whole, ret_descriptor, err);
-}
 
 int stored_scan_put_sum(struct received_projection *projection, int sums, uint64_t turn, struct error *err)
 {
@@ -57,17 +60,16 @@ static int put_part(int file, int part, const struct sum *sum, struct error *err
 	return code;
 }
 
-int store_put_part_sum(const struct stored_scan *scan, int part, const void *bytes, size_t size, struct error *err)
+int store_put_part_sum(struct stored_scan *scan, int part, const void *bytes, size_t size, struct error *err)
 {
 	struct sum sum = {.bytes = size};
-	bool whole;
 	int file, code;
 
 	if (bytes != NULL)
 		sum.crc = checksum(0, bytes, size);
 	if (bytes != NULL && EVP_Digest(bytes, size, sum.sha256, NULL, EVP_sha256(), NULL) != 1)
 		return error_set(err, ERR_INTERNAL, "SHA-256 failed");
-	code = stored_scan_open_records(scan, &whole, &file, err);
+	code = stored_scan_open_sums(scan, &file, err);
 	if (code != 0)
 		return code;
 	code = put_part(file, part, bytes != NULL ? &sum : NULL, err);
@@ -90,11 +92,10 @@ void stored_scan_remove(struct stored_scan *scan, int index)
 }
 
 /* On the disk, as far as that can be: what cannot be noted there is found again by the next who reads it. */
-static void note_lost(const struct stored_scan *scan, int slot, struct sum sum)
+static void note_lost(struct stored_scan *scan, int slot, struct sum sum)
 {
 	struct error err;
-	bool whole;
-	int file, code = stored_scan_open_records(scan, &whole, &file, &err);
+	int file, code = stored_scan_open_sums(scan, &file, &err);
 
 	sum.lost = true;
 	if (code == 0) {
@@ -133,8 +134,7 @@ void stored_scan_lose_behind(struct stored_scan *scan, unsigned long long size)
 {
 	const unsigned long long bytes = stored_scan_bytes(scan);
 	struct error err = {0};
-	bool whole;
-	int file = -1, count = 0, code = stored_scan_open_records(scan, &whole, &file, &err);
+	int file = -1, count = 0, code = stored_scan_open_sums(scan, &file, &err);
 
 	for (int i = (int)(size / bytes); i < scan->count; i++) {
 		struct sum sum = scan->sums[i];
@@ -189,8 +189,8 @@ void stored_scan_lose_image(struct stored_scan *scan, enum image image)
 int store_forget_lost(struct stored_scan *scan, struct error *err)
 {
 	struct catalogue_projection row;
-	bool whole, lost;
-	int file, code = stored_scan_open_records(scan, &whole, &file, err);
+	bool lost;
+	int file, code = stored_scan_open_sums(scan, &file, err);
 
 	if (code != 0)
 		return code;
@@ -244,7 +244,7 @@ static void note_checked(struct stored_scan *scan, int index, const struct sum *
 {
 	struct sum sum = *seen;
 	struct error err;
-	bool whole, mine;
+	bool mine;
 	int file;
 
 	sum.crc = crc;
@@ -257,7 +257,7 @@ static void note_checked(struct stored_scan *scan, int index, const struct sum *
 		scan->unchecked--;
 	}
 	pthread_mutex_unlock(&scan->lock);
-	if (!mine || stored_scan_open_records(scan, &whole, &file, &err) != 0)
+	if (!mine || stored_scan_open_sums(scan, &file, &err) != 0)
 		return;
 	/* The record is not synced: a lost one is made again. */
 	if (sums_put(file, index, &sum, &err) != 0)
@@ -347,12 +347,11 @@ int stored_scan_verify(struct stored_scan *scan, int descriptor, int index, stru
 	return 0;
 }
 
-static int get_part(const struct stored_scan *scan, enum sums_part part, struct sum *ret_sum, bool *ret_known,
+static int get_part(struct stored_scan *scan, enum sums_part part, struct sum *ret_sum, bool *ret_known,
 		    struct error *err)
 {
 	unsigned char state = SUM_NONE;
-	bool whole;
-	int file, code = stored_scan_open_records(scan, &whole, &file, err);
+	int file, code = stored_scan_open_sums(scan, &file, err);
 
 	if (code != 0)
 		return code;
@@ -362,15 +361,14 @@ static int get_part(const struct stored_scan *scan, enum sums_part part, struct 
 	return code;
 }
 
-int store_check_part(const struct stored_scan *scan, enum sums_part part, const void *bytes, size_t size,
-		     struct error *err)
+int store_check_part(struct stored_scan *scan, enum sums_part part, const void *bytes, size_t size, struct error *err)
 {
 	struct sum sum;
 	bool known;
 	int code = get_part(scan, part, &sum, &known, err);
 
 	if (code == ERR_NOT_FOUND)
-		return 0; /* its directory is about to go, or the file was lost since the start */
+		return 0; /* its directory is about to go */
 	if (code == 0 && known && (sum.bytes != size || sum.crc != checksum(0, bytes, size)))
 		code = error_set(err, ERR_DAMAGED, "its bytes do not have the checksum %08x", sum.crc);
 	return code;
@@ -445,6 +443,20 @@ static void check_document(struct stored_scan *scan)
 	pthread_mutex_unlock(&scan->lock);
 }
 
+/* That it was completed, which the catalogue says, gets a record where it has none. */
+static void check_end(struct stored_scan *scan)
+{
+	struct error err;
+	struct sum sum;
+	bool closed, known = false;
+
+	pthread_mutex_lock(&scan->lock);
+	closed = scan->closed;
+	pthread_mutex_unlock(&scan->lock);
+	if (closed && get_part(scan, SUMS_CLOSED, &sum, &known, &err) == 0 && !known)
+		store_put_part_sum(scan, SUMS_CLOSED, "", 0, &err);
+}
+
 static void check_projections(struct stored_scan *scan)
 {
 	char *samples = malloc(stored_scan_bytes(scan));
@@ -471,6 +483,7 @@ static void check_scan(struct stored_scan *scan)
 
 	log_line(LEVEL_INFO, "scan %s: its files are checked", scan->id);
 	check_document(scan);
+	check_end(scan);
 	stored_scan_facts(scan, &facts);
 	for (int i = 0; i < IMAGE_COUNT; i++) {
 		if (facts.image[i])

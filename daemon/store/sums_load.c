@@ -1,4 +1,7 @@
-/* At the start: the rows of projections follow the records beside the samples (projections.sums, store/sums.c). */
+/*
+ * At the start: the rows of projections follow the records beside the samples (projections.sums, store/sums.c). A file
+ * of records that is not whole is made anew from what is known, then and later.
+ */
 #include <errno.h>
 #include <stdlib.h>
 #include <string.h>
@@ -16,18 +19,37 @@ struct records {
 	bool whole;
 };
 
+int stored_scan_find_sums(const struct stored_scan *scan, bool *ret_whole, int *ret_file, struct error *err)
+{
+	char directory[1024];
+
+	store_scan_directory(scan->store, scan->id, directory);
+	return sums_open(directory, true, scan->count, stored_scan_bytes(scan), ret_file, ret_whole, err);
+}
+
+static int allocate(const struct stored_scan *scan, struct records *records, struct error *err)
+{
+	records->projections = calloc((size_t)scan->count, sizeof(*records->projections));
+	records->states = calloc((size_t)scan->count, 1);
+	return records->projections != NULL && records->states != NULL
+		   ? 0
+		   : error_set_errno(err, ENOMEM, "checksums of %d projections", scan->count);
+}
+
+static void clear(struct records *records)
+{
+	free(records->projections);
+	free(records->states);
+}
+
 static int read_records(const struct stored_scan *scan, struct records *ret, struct error *err)
 {
 	struct error why;
-	int file, code = stored_scan_open_records(scan, &ret->whole, &file, &why);
+	int file, code = allocate(scan, ret, err);
 
-	ret->projections = calloc((size_t)scan->count, sizeof(*ret->projections));
-	ret->states = calloc((size_t)scan->count, 1);
-	if (ret->projections == NULL || ret->states == NULL) {
-		if (code == 0)
-			close(file);
-		return error_set_errno(err, ENOMEM, "checksums of %d projections", scan->count);
-	}
+	if (code != 0)
+		return code;
+	code = stored_scan_find_sums(scan, &ret->whole, &file, &why);
 	if (code == ERR_NOT_FOUND || code == ERR_INVALID)
 		return 0; /* none, or another scan's: as if all were blank */
 	if (code != 0) {
@@ -51,7 +73,7 @@ static int write_records(const struct stored_scan *scan, const struct records *r
 	store_scan_directory(scan->store, scan->id, directory);
 	code = sums_create(directory, scan->count, stored_scan_bytes(scan), err);
 	if (code == 0)
-		code = stored_scan_open_records(scan, &whole, &file, err);
+		code = stored_scan_find_sums(scan, &whole, &file, err);
 	if (code != 0)
 		return code;
 	for (int i = 0; i < PARTS && code == 0; i++) {
@@ -177,7 +199,37 @@ int store_load_sums(struct store *store, struct stored_scan *scan, struct error 
 		raise_order_floor(scan);
 	if (code == 0 && !records.whole && !scan->gone)
 		code = write_records(scan, &records, err);
-	free(records.projections);
-	free(records.states);
+	clear(&records);
+	return code;
+}
+
+int store_make_sums(struct stored_scan *scan, struct error *err)
+{
+	struct records records = {.whole = false};
+	int code = allocate(scan, &records, err);
+
+	log_line(LEVEL_ERROR,
+		 "scan %s: its " SUMS_FILE " is gone or damaged: it is made again, and all of its files are checked",
+		 scan->id);
+	if (code == 0) {
+		pthread_mutex_lock(&scan->lock);
+		for (int i = 0; i < scan->count; i++) {
+			const bool stored = scan->progress[i] == STORED && scan->sums[i].bytes != 0;
+
+			if (!stored && !scan->lost[i])
+				continue;
+			records.projections[i] = scan->sums[i];
+			records.projections[i].bytes = stored_scan_bytes(scan);
+			records.projections[i].lost = scan->lost[i] != 0;
+			records.states[i] = SUM_GOOD;
+		}
+		pthread_mutex_unlock(&scan->lock);
+		code = write_records(scan, &records, err);
+	}
+	clear(&records);
+	if (code != 0)
+		store_distrust(scan->store, err);
+	else
+		store_scan_suspect(scan->store, scan->id);
 	return code;
 }

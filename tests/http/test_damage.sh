@@ -255,6 +255,76 @@ test_a_file_that_is_cut_off_under_the_daemon() {
 	stop_daemon
 }
 
+test_checksums_that_go_under_the_daemon_are_made_again() {
+	local size=$((512 + 64 * 24)) how
+	start_daemon
+	reconstruct "$scan_dir" "$small"
+	undisturbed
+	for how in 'rm "$(spool)/projections.sums"' 'truncate -s 1000 "$(spool)/projections.sums"' 'flip "$(spool)/projections.sums" 20'; do
+		eval "$how"
+		put_view 3
+		expect_status 200
+		missing_is '[]'
+		eval "$how"
+		post_job "$small"
+		wait_job succeeded
+		is_undisturbed
+		# one that was lost is stored in the new file, with the others, also behind a restart
+		flip "$(spool)/projections.raw" $((5 * one + 99))
+		req GET "/v1/scans/$scan/projections/5?format=raw"
+		expect_damaged
+		eval "$how"
+		put_view 6
+		expect_status 200
+		missing_is '[[5, 5]]'
+		stop_daemon KILL
+		start_daemon
+		req PUT "/v1/scans/$scan/projections/5" --data-binary @<(view 6)
+		expect_problem 409
+		put_view 5
+		expect_status 201
+		missing_is '[]'
+		[ "$(stat -c %s "$(spool)/projections.sums")" = $size ] || fail "the checksums are there again"
+	done
+	cmp "$(spool)/projections.raw" "$scan_dir/projections.raw" || fail "the samples"
+	stop_daemon
+}
+
+test_projections_whose_file_goes_under_the_daemon_can_be_sent_again() {
+	local end
+	start_daemon
+	reconstruct "$scan_dir" "$small"
+	undisturbed
+	rm "$(spool)/projections.raw"
+	req GET "/v1/scans/$scan/projections/7?format=raw"
+	[ "$status" = 404 ] || expect_damaged # the check that this begins may be faster
+	expect_json '.detail | test("projection 7 ")'
+	end=$((SECONDS + patience))
+	until req GET "/v1/scans/$scan" && member '.missing == [[0, 23]]' "$body" >/dev/null; do
+		[ $SECONDS -lt $end ] || fail "all of it is missing: $(json .missing)"
+		sleep 0.05
+	done
+	expect_json '.state == "receiving" and ([.warnings[] | select(.code == "damaged_projections")] | length == 1)'
+	req PUT "/v1/scans/$scan/projections" -T "$scan_dir/projections.raw"
+	expect_status 201
+	missing_is '[]'
+	# what is sent meets the loss itself
+	rm "$(spool)/projections.raw"
+	put_view 3
+	expect_status 201
+	req PUT "/v1/scans/$scan/projections" -T "$scan_dir/projections.raw"
+	expect_status 201
+	missing_is '[]'
+	stop_daemon KILL
+	start_daemon
+	missing_is '[]'
+	cmp "$(spool)/projections.raw" "$scan_dir/projections.raw" || fail "the samples"
+	post_job "$small"
+	wait_job succeeded
+	is_right
+	stop_daemon
+}
+
 test_damage_while_the_daemon_is_down() {
 	local byte
 	start_daemon
@@ -383,6 +453,9 @@ test_what_the_catalogue_lost_is_found_beside_the_data() {
 	start_daemon
 	post_scan "$counts_dir"
 	post_projections "$counts_dir"
+	rm "$(spool)/projections.sums" # and made again, of the images, too, when they were checked
+	post_job "$small"
+	wait_job succeeded
 	stop_daemon
 	sqlite3 "$state/catalogue.sqlite" "DELETE FROM projections; UPDATE scans SET flat = NULL, dark = NULL, defects = NULL"
 	start_daemon
