@@ -427,8 +427,7 @@ test_cancel_among_many_short_iterations() {
 	post_scan "$work/tiny"
 	post_projections "$work/tiny"
 	post_job '{"scan": "SCAN", "grid": {"size": [4, 4, 2], "spacing_mm": [2, 2, 2]}, "sart": {"iterations": 100000, "subsets": 1}}'
-	state_becomes running
-	sleep 0.1
+	until req GET "/v1/jobs/$job" && [ "$(json '.iteration')" -gt 100 ]; do sleep 0.02; done
 	req DELETE "/v1/jobs/$job?wait=10"
 	expect_json '.state == "cancelled" and (.history | length > 100)'
 }
