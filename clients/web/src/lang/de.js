@@ -667,6 +667,7 @@ export const strings = {
 	'The image does not agree with the projections: it may be wrong, or need far more iterations.': 'Das Bild passt nicht zu den Projektionen: Es kann falsch sein oder weit mehr Iterationen brauchen.',
 	'Noise reduction was asked for after iterations, and there were none.': 'Glättung war nach Iterationen verlangt, und es gab keine.',
 	'The noise reduction that was asked for is too weak for this scan: the image is about as noisy as without it.': 'Die verlangte Glättung ist für diesen Scan zu schwach: Das Bild rauscht etwa wie ohne sie.',
+	'The patient goes on outside of the image: then taking out the streaks of metal can make the image worse.': 'Der Patient geht über das Bild hinaus: Dann kann es das Bild verschlechtern, die Streifen von Metall zu entfernen.',
 	'There is metal: what is shown within 10 mm of it is an estimate.': 'Es gibt Metall: Was näher als 10 mm daran gezeigt wird, ist eine Schätzung.',
 	'No metal was found in the image.': 'Im Bild wurde kein Metall gefunden.',
 	'gray levels': 'Graustufen',
