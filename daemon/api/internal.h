@@ -165,7 +165,7 @@ int job_wait_begin(struct request *request, struct job *job, double seconds, str
 /* A removed job's files are forgotten: a descriptor or mapping that is still open would keep their space. */
 void job_forget_files(struct api *api, struct job *job);
 
-/* As store_volume_verify; damage is a warning of the job, too. */
+/* As store_volume_verify; damage is a warning of the job, too, until all of the volume was found whole. */
 int volume_verify(struct api *api, const char *job, const struct volume_record *volume, uint64_t first, uint64_t bytes,
 		  struct error *err);
 

@@ -118,17 +118,21 @@ int volume_verify(struct api *api, const char *job, const struct volume_record *
 		  struct error *err)
 {
 	int code = store_volume_verify(api->store, job, volume, first, bytes, err);
+	const bool whole = code == 0 && first == 0 && bytes >= volume->bytes;
 	struct error ignored;
 	struct job_facts facts;
 	struct job *found;
 
-	if ((code != ERR_DAMAGED && code != ERR_NOT_FOUND) || jobs_find(api->jobs, job, &found, &ignored) != 0)
+	if ((code != ERR_DAMAGED && code != ERR_NOT_FOUND && !whole) ||
+	    jobs_find(api->jobs, job, &found, &ignored) != 0)
 		return code;
 	job_facts(found, &facts);
 	if (code == ERR_NOT_FOUND && !facts.removed) /* the files of a removed job go with it */
 		code = store_volume_gone(volume, err);
 	if (code == ERR_DAMAGED)
 		job_add_warning(found, "damaged_volume", err->text, &ignored);
+	if (whole)
+		job_volume_whole(found, volume->name);
 	job_release(found);
 	return code;
 }

@@ -64,14 +64,13 @@ static int find_voxels(int file, const char *path, const struct volume_record *v
 	if (code != 0 && code != ERR_NOT_FOUND)
 		return code;
 	if (volume_own_start(file, path, &volume->grid, &voxels.start, err) != 0 || fstat(file, &status) != 0)
-		code = error_set(err, ERR_DAMAGED, "the volume %s is damaged on the disk: its header", volume->name);
+		code = store_volume_damaged(volume->name, "its header", err);
 	else
 		code = 0;
 	voxels.end = voxels.seal.count > 0 ? voxels.seal.content : voxels.start + volume->bytes;
 	/* The file is of a version that wrote no checksums, or they are damaged. */
 	if (code == 0 && voxels.seal.count == 0 && (size_t)status.st_size != voxels.end)
-		code = error_set(err, ERR_DAMAGED, "the volume %s is damaged on the disk: its checksums are gone",
-				 volume->name);
+		code = store_volume_damaged(volume->name, "its checksums are gone", err);
 	if (code != 0)
 		seal_clear(&voxels.seal);
 	else
@@ -91,12 +90,13 @@ static int hash_voxels(int file, const char *name, const struct voxels *voxels, 
 		size_t skip = voxels->start <= at ? 0 : voxels->start - at < bytes ? voxels->start - at : bytes;
 
 		code = file_read_at(file, block, bytes, at, name, err);
-		if (code == 0 && voxels->seal.count > 0 && checksum(0, block, bytes) != voxels->seal.blocks[number])
-			code = error_set(
-			    err, ERR_DAMAGED,
-			    "the volume %s is damaged on the disk (block %d of %d does not fit its checksum): "
-			    "it has to be made again",
-			    name, number, voxels->seal.count);
+		if (code == 0 && voxels->seal.count > 0 && checksum(0, block, bytes) != voxels->seal.blocks[number]) {
+			char why[80];
+
+			snprintf(why, sizeof(why), "block %d of %d does not fit its checksum", number,
+				 voxels->seal.count);
+			code = store_volume_damaged(name, why, err);
+		}
 		if (code == 0 && EVP_DigestUpdate(digest, block + skip, bytes - skip) != 1)
 			code = error_set(err, ERR_INTERNAL, "SHA-256 failed");
 		if (atomic_load(stop))
@@ -208,6 +208,9 @@ static int make_digest(struct digester *digester, struct job *job, const struct 
 	if (code == 0)
 		code = job_digest_volume(job, volume, err);
 	volume->hashed = code == 0;
+	/* It may have been made again because the disk had damaged it. */
+	if (code == 0)
+		job_volume_whole(job, volume->name);
 	return code;
 }
 

@@ -329,6 +329,8 @@ int job_sync_volumes(struct job *job, struct error *err);
 /* See store_job_digest_volume. */
 int job_digest_volume(struct job *job, const struct volume_record *volume, struct error *err);
 int job_add_warning(struct job *job, const char *code, const char *detail, struct error *err);
+/* All of a volume was found whole: no warning says any more that it is damaged, but for a failure that is logged. */
+void job_volume_whole(struct job *job, const char *volume);
 /* What its warnings say of projections; remembered until the next warning. Any thread. */
 struct job_views {
 	bool told; /* false: nothing, and the rest is 0 */

@@ -550,6 +550,19 @@ int job_add_warning(struct job *job, const char *code_name, const char *detail, 
 	return code;
 }
 
+void job_volume_whole(struct job *job, const char *volume)
+{
+	struct error err;
+	bool gone = false;
+
+	if (store_job_volume_whole(job->jobs->store, job->id, volume, &gone, &err) != 0)
+		log_line(LEVEL_WARNING, "job %s: a warning of its volume %s stays: %s", job->id, volume, err.text);
+	if (!gone)
+		return;
+	log_line(LEVEL_INFO, "job %s: its volume %s is whole again", job->id, volume);
+	job_wake(job);
+}
+
 void job_forget_views(struct job *job)
 {
 	pthread_mutex_lock(&job->jobs->lock);

@@ -204,6 +204,12 @@ int catalogue_unsent(struct catalogue *catalogue, void (*visit)(void *context, c
 /* Writes the digest of the volume of this name and time of making, in a group, if the volume is still there. */
 int catalogue_set_digest(struct catalogue *catalogue, const char *job, const struct volume_record *volume,
 			 struct error *err);
+/*
+ * Removes the job's warnings that have the code of `kept` and whose details begin with `beginning`, but for `kept`
+ * itself, in a group. *ret_count: how many they were.
+ */
+int catalogue_take_warnings(struct catalogue *catalogue, const char *job, const char *beginning,
+			    const struct warning_record *kept, int *ret_count, struct error *err);
 /* Does what store_job_events says. */
 int catalogue_events(struct catalogue *catalogue, const char *job, long long after, int limit,
 		     struct event_record **ret_events, int *ret_count, struct error *err);

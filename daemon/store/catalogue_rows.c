@@ -131,6 +131,33 @@ int catalogue_unsent(struct catalogue *catalogue, void (*visit)(void *context, c
 			      NULL, 0, visit_id, &each, err);
 }
 
+static int count_row(void *context, const struct value *values, struct error *err)
+{
+	int *count = context;
+
+	(void)values;
+	(void)err;
+	++*count;
+	return 0;
+}
+
+int catalogue_take_warnings(struct catalogue *catalogue, const char *job, const char *beginning,
+			    const struct warning_record *kept, int *ret_count, struct error *err)
+{
+	const struct value values[] = {value_text(job), value_text(kept->code), value_text(beginning),
+				       value_text(kept->detail)};
+	int count = 0, code;
+
+	code = catalogue->backend->run(catalogue->database, SESSION_WRITER,
+				       "DELETE FROM warnings WHERE job = (SELECT number FROM jobs WHERE id = $1)"
+				       " AND code = $2 AND substr(detail, 1, length($3)) = $3 AND detail <> $4"
+				       " RETURNING number",
+				       values, 4, count_row, &count, err);
+	if (code == 0)
+		*ret_count = count;
+	return code;
+}
+
 int catalogue_set_digest(struct catalogue *catalogue, const char *job, const struct volume_record *volume,
 			 struct error *err)
 {

@@ -105,6 +105,17 @@ void verified_free(struct verified *verified); /* NULL is fine */
 bool verified_knows(struct verified *verified, const struct stat *status, int part);
 void verified_note(struct verified *verified, const struct stat *status, int part);
 
+/* ---- store/damage.c ---- */
+
+enum { DAMAGE_SIZE = 128 };
+extern const char damage_code[]; /* of the warning */
+/* What all details of such a warning of this volume begin with. */
+void damage_beginning(const char *volume, char ret_text[DAMAGE_SIZE]);
+/* Whether the warning is such a one, and what it begins with. */
+bool damage_told(const struct warning_record *warning, char ret_beginning[DAMAGE_SIZE]);
+/* Whether one of them is of this volume. */
+bool damage_told_of(const struct warning_record *warnings, int count, const char *volume);
+
 /* store/reconcile.c. Called while nobody else has the store. */
 int store_reconcile(struct store *store, bool fresh, struct error *err);
 /* Moves scans and jobs that are whole out of quarantine/ again, before the catalogue is made again. */

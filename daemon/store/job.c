@@ -286,17 +286,46 @@ int store_job_remove_volume(struct store *store, const char *id, const char *nam
 int store_job_add_warning(struct store *store, const char *id, const struct warning_record *warning,
 			  const struct event *event, bool *ret_new, struct error *err)
 {
+	char beginning[DAMAGE_SIZE];
 	long long new = 0;
-	int code = store_begin(store, err);
+	int gone = 0, code = store_begin(store, err);
 
 	if (code != 0)
 		return code;
-	code = catalogue_put(store->catalogue, id, warning, &new, err);
+	if (damage_told(warning, beginning))
+		code = catalogue_take_warnings(store->catalogue, id, beginning, warning, &gone, err);
+	if (code == 0)
+		code = catalogue_put(store->catalogue, id, warning, &new, err);
 	if (code == 0 && new != 0)
 		code = add_event(store, id, event, err);
-	code = new != 0 ? end_with_record(store, id, false, code, err) : store_end(store, code, err);
+	code = new != 0 || gone != 0 ? end_with_record(store, id, false, code, err) : store_end(store, code, err);
 	if (code == 0)
 		*ret_new = new != 0;
+	return code;
+}
+
+int store_job_volume_whole(struct store *store, const char *id, const char *volume, bool *ret_gone, struct error *err)
+{
+	struct warning_record none = {.detail = ""}, *warnings;
+	char beginning[DAMAGE_SIZE];
+	int count, gone = 0, code = store_job_warnings(store, id, &warnings, &count, err);
+	bool told;
+
+	if (code != 0)
+		return code;
+	/* Whole volumes are read often: only a warning that is there is worth a group. */
+	told = damage_told_of(warnings, count, volume);
+	free(warnings);
+	if (told)
+		code = store_begin(store, err);
+	if (told && code == 0) {
+		snprintf(none.code, sizeof(none.code), "%s", damage_code);
+		damage_beginning(volume, beginning);
+		code = catalogue_take_warnings(store->catalogue, id, beginning, &none, &gone, err);
+		code = end_with_record(store, id, false, code, err);
+	}
+	if (code == 0)
+		*ret_gone = gone != 0;
 	return code;
 }
 

@@ -90,18 +90,18 @@ static int sweep_file(void *context, const char *name, struct error *err)
 	return 0;
 }
 
-/* A volume that is gone is a warning of its job; where that fails, a request for the volume says so. */
-static void warn_gone(const struct sweep *sweep, const struct volume_record *volume)
+/* A damaged volume is a warning of its job; where that fails, a request for the volume says so. */
+static void warn(const struct sweep *sweep, const char *damage)
 {
-	struct warning_record warning = {.code = "damaged_volume"};
+	struct warning_record warning = {.detail = ""};
 	struct event event = {.kind = "warning"};
 	cJSON *document;
 	struct error err;
 	bool new;
 
-	store_volume_gone(volume, &err);
-	log_line(LEVEL_ERROR, "job %s: %s", sweep->id, err.text);
-	snprintf(warning.detail, sizeof(warning.detail), "%s", err.text);
+	log_line(LEVEL_ERROR, "job %s: %s", sweep->id, damage);
+	snprintf(warning.code, sizeof(warning.code), "%s", damage_code);
+	snprintf(warning.detail, sizeof(warning.detail), "%s", damage);
 	document = json_warning(warning.code, warning.detail);
 	event.data = json_print(document, NULL);
 	cJSON_Delete(document);
@@ -112,15 +112,44 @@ static void warn_gone(const struct sweep *sweep, const struct volume_record *vol
 	free(event.data);
 }
 
-static void check_volumes(const struct sweep *sweep)
+/* Somebody may have put the good file of a volume back that a warning calls damaged. */
+static void check_damaged(const struct sweep *sweep, const struct volume_record *volume)
 {
-	char path[1024];
+	struct error err;
+	bool gone;
+	int code = store_volume_verify(sweep->store, sweep->id, volume, 0, volume->bytes, &err);
 
+	if (code == ERR_DAMAGED)
+		warn(sweep, err.text);
+	if (code == 0)
+		code = store_job_volume_whole(sweep->store, sweep->id, volume->name, &gone, &err);
+	if (code != 0 && code != ERR_DAMAGED)
+		log_line(LEVEL_WARNING, "job %s: the warning of its volume %s stays: %s", sweep->id, volume->name,
+			 err.text);
+}
+
+static int check_volumes(const struct sweep *sweep, struct error *err)
+{
+	struct warning_record *warnings;
+	int count;
+
+	if (store_job_warnings(sweep->store, sweep->id, &warnings, &count, err) != 0)
+		return err->code;
 	for (int i = 0; i < sweep->count; i++) {
-		store_volume_path(sweep->store, sweep->id, sweep->volumes[i].name, path);
-		if (access(path, F_OK) != 0 && errno == ENOENT)
-			warn_gone(sweep, &sweep->volumes[i]);
+		const struct volume_record *volume = &sweep->volumes[i];
+		struct error damage;
+		char path[1024];
+
+		store_volume_path(sweep->store, sweep->id, volume->name, path);
+		if (access(path, F_OK) != 0 && errno == ENOENT) {
+			store_volume_gone(volume, &damage);
+			warn(sweep, damage.text);
+		} else if (damage_told_of(warnings, count, volume->name)) {
+			check_damaged(sweep, volume);
+		}
 	}
+	free(warnings);
+	return 0;
 }
 
 static int compare_id(const void *id, const void *job)
@@ -152,10 +181,10 @@ static int sweep_directory(void *context, const char *name, struct error *err)
 		return code;
 	if (state == JOB_WAITING || state == JOB_RUNNING) /* a worker has it, or had it */
 		code = remove_unsettled(sweep.store, name, sweep.volumes, &sweep.count, err);
-	if (code == 0) {
-		check_volumes(&sweep);
+	if (code == 0)
+		code = check_volumes(&sweep, err);
+	if (code == 0)
 		code = directory_visit(path, sweep_file, &sweep, err);
-	}
 	free(sweep.volumes);
 	return code;
 }

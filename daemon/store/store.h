@@ -551,7 +551,8 @@ int store_job_digest_volume(struct store *store, const char *id, const struct vo
  */
 int store_volume_verify(struct store *store, const char *job, const struct volume_record *volume, uint64_t first,
 			uint64_t bytes, struct error *err);
-/* ERR_DAMAGED, and the words for a volume whose file is gone though its job is not. */
+/* ERR_DAMAGED, and the words for a volume of this name whose file is not what was written, or is gone. */
+int store_volume_damaged(const char *volume, const char *why, struct error *err);
 int store_volume_gone(const struct volume_record *volume, struct error *err);
 /* A worker has just made the file: what is read of it is still in memory. */
 void store_volume_trust(struct store *store, const char *job, const struct volume_record *volume);
@@ -560,9 +561,14 @@ int store_jobs_undigested(struct store *store, void (*visit)(void *context, cons
 			  struct error *err);
 /* The row; then the file may go. */
 int store_job_remove_volume(struct store *store, const char *id, const char *name, struct error *err);
-/* *ret_new false, and no event, when this very warning is there already. */
+/*
+ * *ret_new false, and no event, when this very warning is there already. A damaged volume has one warning: the latest
+ * of store_volume_damaged's words for it.
+ */
 int store_job_add_warning(struct store *store, const char *id, const struct warning_record *warning,
 			  const struct event *event, bool *ret_new, struct error *err);
+/* All of the volume was found whole: a warning that it is damaged goes. *ret_gone: there was one. */
+int store_job_volume_whole(struct store *store, const char *id, const char *volume, bool *ret_gone, struct error *err);
 
 /*
  * Writes sendings, new ones or those with their names anew, each with its event; the one named `taken` (NULL: none)

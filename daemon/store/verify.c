@@ -138,12 +138,6 @@ bool verified_knows(struct verified *verified, const struct stat *status, int bl
 
 /* ---- reading ---- */
 
-static int damaged(struct error *err, const struct volume_record *volume, const char *why)
-{
-	return error_set(err, ERR_DAMAGED, "the volume %s is damaged on the disk (%s): it has to be made again",
-			 volume->name, why);
-}
-
 static int check_block(int file, const struct seal *seal, int block, void *buffer, const struct volume_record *volume,
 		       struct error *err)
 {
@@ -155,7 +149,7 @@ static int check_block(int file, const struct seal *seal, int block, void *buffe
 	    checksum(0, buffer, bytes) == seal->blocks[block])
 		return 0;
 	snprintf(text, sizeof(text), "block %d of %d does not fit its checksum", block, seal->count);
-	return damaged(err, volume, text);
+	return store_volume_damaged(volume->name, text, err);
 }
 
 /* Checks the blocks that hold bytes first .. last of the file, and the first block, where the header is. */
@@ -180,7 +174,7 @@ static int check_blocks(struct verified *verified, int file, const struct stat *
 
 int store_volume_gone(const struct volume_record *volume, struct error *err)
 {
-	return damaged(err, volume, "its file is gone");
+	return store_volume_damaged(volume->name, "its file is gone", err);
 }
 
 /* Checks a file whose checksums are missing or damaged against the digest in the catalogue. */
@@ -198,7 +192,7 @@ static int check_digest(int file, const struct stat *status, const struct volume
 		goto out;
 	}
 	if (volume_own_start(file, volume->name, &volume->grid, &start, err) != 0) {
-		code = damaged(err, volume, "its header");
+		code = store_volume_damaged(volume->name, "its header", err);
 		goto out;
 	}
 	/* The file is of a version that wrote no checksums, and not yet hashed: it cannot be checked. */
@@ -213,7 +207,7 @@ static int check_digest(int file, const struct stat *status, const struct volume
 	}
 	if (code != 0 || EVP_DigestFinal_ex(digest, sha256, NULL) != 1 || !volume->hashed ||
 	    memcmp(sha256, volume->sha256, sizeof(sha256)) != 0)
-		code = damaged(err, volume, "its checksums are gone, and its digest does not fit");
+		code = store_volume_damaged(volume->name, "its checksums are gone, and its digest does not fit", err);
 out:
 	EVP_MD_CTX_free(digest);
 	free(block);

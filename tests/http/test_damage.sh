@@ -481,7 +481,68 @@ expect_damaged_volume() { # TARGET ...: under all of these
 		expect_json '.detail | test("volume final")'
 	done
 	req GET "/v1/jobs/$job"
-	expect_json '[.warnings[] | select(.code == "damaged_volume" and .severity == "serious" and (.detail | test("final")))] | length >= 1'
+	expect_json '[.warnings[] | select(.code == "damaged_volume" and .severity == "serious" and (.detail | test("final")))] | length == 1'
+}
+damage_told() { # [REGEX]: the one detail of the job's warnings of damaged volumes; none: there is no such warning
+	req GET "/v1/jobs/$job"
+	expect_json "[.warnings[] | select(.code == \"damaged_volume\") | .detail] | if \"${1:-}\" == \"\" then . == [] else length == 1 and (.[0] | test(\"${1:-}\")) end"
+}
+
+test_a_damaged_volume_is_told_once_and_as_long_as_it_is_damaged() {
+	local file
+	start_daemon
+	reconstruct "$scan_dir" "$large"
+	digested
+	undisturbed
+	file=$(made)
+	cp "$file" "$work/good.nii"
+	# three kinds of damage, each told in place of the one before
+	flip "$file" $((4096 + 2 * 1048576))
+	expect_damaged_volume "" "?format=raw"
+	damage_told 'block 2 of 4'
+	cp "$work/good.nii" "$file"
+	flip "$file" 300
+	expect_damaged_volume ""
+	damage_told 'block 0 of 4'
+	cp "$work/good.nii" "$file"
+	truncate -s $((4096 + 1048576)) "$file"
+	expect_damaged_volume ""
+	damage_told 'its (header|checksums)'
+	# what is whole of it by itself takes nothing back; all of it does, for good
+	cp "$work/good.nii" "$file"
+	flip "$file" $((4096 + 2 * 1048576))
+	expect_damaged_volume ""
+	req GET "/v1/jobs/$job/volumes/final?format=raw" -r 0-999
+	expect_status 206
+	damage_told 'block 2 of 4'
+	cp "$work/good.nii" "$file"
+	is_undisturbed
+	damage_told
+	stop_daemon
+	start_daemon
+	damage_told
+	# the check at the start
+	stop_daemon KILL
+	rm "$file"
+	start_daemon
+	damage_told 'its file is gone'
+	stop_daemon
+	cp "$work/good.nii" "$file"
+	flip "$file" 300
+	start_daemon
+	damage_told 'block 0 of 4'
+	stop_daemon
+	cp "$work/good.nii" "$file"
+	start_daemon
+	damage_told
+	is_undisturbed
+	# a part of the stream is a read, too
+	flip "$file" 300
+	expect_damaged_volume ""
+	cp "$work/good.nii" "$file"
+	curl -sf --max-time 20 -o "$work/stream" "$url/v1/jobs/$job/stream?format=raw" || fail "a stream"
+	damage_told
+	stop_daemon
 }
 
 test_a_damaged_volume_is_told_and_never_sent() {

@@ -524,6 +524,54 @@ START_TEST(a_key_makes_one_job_also_over_a_restart)
 }
 END_TEST
 
+static void expect_warnings(const char *id, int expected, const char *const *details)
+{
+	struct warning_record *warnings;
+	struct error err = {0};
+	int count;
+
+	ck_assert_int_eq(store_job_warnings(state.store, id, &warnings, &count, &err), 0);
+	ck_assert_int_eq(count, expected);
+	for (int i = 0; i < count; i++)
+		ck_assert_ptr_nonnull(strstr(warnings[i].detail, details[i]));
+	free(warnings);
+}
+
+static void damage(struct job *job, const char *volume, const char *why)
+{
+	struct error words, err = {0};
+
+	ck_assert_int_eq(store_volume_damaged(volume, why, &words), ERR_DAMAGED);
+	ck_assert_int_eq(job_add_warning(job, "damaged_volume", words.text, &err), 0);
+}
+
+START_TEST(a_damaged_volume_has_one_warning_until_it_is_whole)
+{
+	struct job *job = state_post(&state, scan, "routine");
+	struct error err = {0};
+	char id[ID_SIZE];
+
+	keep_id(job, id);
+	damage(job, "iter-1", "block 2 of 4");
+	damage(job, "iter-10", "block 3 of 4");
+	damage(job, "iter-1", "its header");
+	damage(job, "iter-1", "its header");
+	ck_assert_int_eq(job_add_warning(job, "arc", "the volume iter-1 is damaged on the disk", &err), 0);
+	expect_warnings(id, 3,
+			(const char *[]){"iter-10 is damaged on the disk (block 3", "(its header)", "iter-1 is"});
+	damage(job, "iter-10", "its file is gone");
+	expect_warnings(id, 3,
+			(const char *[]){"(its header)", "iter-1 is", "iter-10 is damaged on the disk (its file"});
+	job_volume_whole(job, "iter-1");
+	job_volume_whole(job, "final");
+	expect_warnings(id, 2, (const char *[]){"iter-1 is", "iter-10"});
+	job_volume_whole(job, "iter-10");
+	job_release(job);
+	restart();
+	expect_warnings(id, 1, (const char *[]){"iter-1 is"});
+}
+END_TEST
+
 START_TEST(events_come_in_order_from_where_one_left_off)
 {
 	static const char *const expected[] = {"state",  "state",    "warning", "progress",
@@ -989,6 +1037,7 @@ Suite *job_suite(void)
 	tcase_add_test(tests, deleting_cancels_first_and_then_removes);
 	tcase_add_test(tests, a_scan_stays_while_a_job_needs_it);
 	tcase_add_test(tests, a_key_makes_one_job_also_over_a_restart);
+	tcase_add_test(tests, a_damaged_volume_has_one_warning_until_it_is_whole);
 	tcase_add_test(tests, events_come_in_order_from_where_one_left_off);
 	tcase_add_test(tests, rows_of_one_commit_are_told_one_by_one);
 	tcase_add_test(tests, a_volume_whose_row_is_missing_is_made_again);
