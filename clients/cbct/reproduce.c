@@ -4,6 +4,7 @@
  */
 #include <errno.h>
 #include <math.h>
+#include <signal.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
@@ -58,6 +59,7 @@ struct work {
 	struct provenance was, is;
 	cJSON *recipe;
 	char job[100]; /* that has made it again */
+	bool given_up; /* the job would never, or shall not, make it */
 };
 
 /* ---- the volume as it was ---- */
@@ -199,6 +201,121 @@ static void name_of_volume(const struct work *work, char ret_name[40])
 		snprintf(ret_name, 40, "%s", strcmp(work->was.stage, "fdk") == 0 ? "fdk" : "fdk-tv");
 }
 
+/* The signal that ends the command when the job is removed; a second one does so at once. */
+static volatile sig_atomic_t interrupted;
+
+static void note_signal(int number)
+{
+	interrupted = number;
+}
+
+static void catch_signals(void)
+{
+	/* No request is cut short: the signal is seen at the next look at the job. */
+	struct sigaction action = {.sa_handler = note_signal, .sa_flags = (int)SA_RESETHAND | SA_RESTART};
+
+	sigaction(SIGINT, &action, NULL);
+	sigaction(SIGTERM, &action, NULL);
+}
+
+/* "7, 11-13" of [[7, 7], [11, 13]], cut where there is no room. */
+static void print_ranges(const cJSON *ranges, char *text, size_t size)
+{
+	const cJSON *range;
+	size_t used = 0;
+
+	text[0] = '\0';
+	cJSON_ArrayForEach(range, ranges)
+	{
+		const double first = cJSON_GetNumberValue(cJSON_GetArrayItem(range, 0));
+		const double last = cJSON_GetNumberValue(cJSON_GetArrayItem(range, 1));
+		const char *comma = used > 0 ? ", " : "";
+		char one[60];
+
+		if (last > first)
+			snprintf(one, sizeof(one), "%s%.10g-%.10g", comma, first, last);
+		else
+			snprintf(one, sizeof(one), "%s%.10g", comma, first);
+		if (used + strlen(one) + sizeof(", ...") > size) {
+			snprintf(text + used, size - used, ", ...");
+			return;
+		}
+		used += (size_t)snprintf(text + used, size - used, "%s", one);
+	}
+}
+
+static int tell_missing(struct work *work, const char *scan, struct error *err)
+{
+	cJSON *document = NULL;
+	char path[200], ranges[120];
+	int code;
+
+	snprintf(path, sizeof(path), "/v1/scans/%.100s", scan);
+	code = http_json(work->http, "GET", path, &document, err);
+	if (code == 0) {
+		print_ranges(cJSON_GetObjectItemCaseSensitive(document, "missing"), ranges, sizeof(ranges));
+		code = error_set(err, ERR_IO,
+				 "projections: %s of the scan %.60s are not there, or damaged on the disk: "
+				 "the volume cannot be made again",
+				 ranges, scan);
+	}
+	cJSON_Delete(document);
+	return code;
+}
+
+/* What a job waits for that nobody will send ends the watch: the scan had all of it when the volume was made. */
+static int check_job(void *context, const cJSON *job, struct error *err)
+{
+	struct work *work = context;
+	const char *scan = member_text(job, "scan", ""), *image = NULL;
+	bool projections = false, checking = false;
+	const cJSON *obstacle;
+
+	cJSON_ArrayForEach(obstacle, cJSON_GetObjectItemCaseSensitive(job, "waiting_for"))
+	{
+		const char *what = cJSON_GetStringValue(obstacle);
+
+		if (what == NULL)
+			continue;
+		projections = projections || strcmp(what, "projections") == 0;
+		checking = checking || strcmp(what, "check") == 0;
+		for (int i = 0; i < IMAGE_COUNT; i++)
+			image = strcmp(what, image_kinds[i].name) == 0 ? image_kinds[i].title : image;
+		image = strcmp(what, "scatter") == 0 ? "scatter images" : image;
+	}
+	work->given_up = interrupted != 0 || (!checking && (projections || image != NULL));
+	if (interrupted != 0)
+		return error_set(err, ERR_CANCELLED, "interrupted");
+	if (!work->given_up)
+		return 0;
+	if (projections)
+		return tell_missing(work, scan, err);
+	return error_set(err, ERR_IO,
+			 "%s: of the scan %.60s not there, or damaged on the disk: the volume cannot be made again",
+			 image, scan);
+}
+
+/* Once to cancel it, where it has not ended, and once to remove it. */
+static void remove_job(const struct work *work)
+{
+	static const char *const waits[] = {"?wait=10", ""};
+	bool gone = false;
+	int code = 0;
+
+	for (int i = 0; i < 2 && code == 0 && !gone; i++) {
+		cJSON *document = NULL;
+		struct error err;
+		char path[200];
+
+		snprintf(path, sizeof(path), "/v1/jobs/%.100s%s", work->job, waits[i]);
+		code = http_json(work->http, "DELETE", path, &document, &err);
+		gone = code == 0 && document == NULL;
+		cJSON_Delete(document);
+		if (code != 0)
+			fprintf(stderr, "the job %s is left on the daemon: %s\n", work->job, err.text);
+	}
+}
+
 static int make_on_daemon(struct work *work, struct error *err)
 {
 	const char *scan = work->options->scan != NULL ? work->options->scan : work->was.scan;
@@ -211,11 +328,12 @@ static int make_on_daemon(struct work *work, struct error *err)
 	document = make_document(work, scan);
 	labels = cJSON_AddObjectToObject(document, "labels");
 	cJSON_AddStringToObject(labels, "reproduces", work->was.job[0] != '\0' ? work->was.job : "file");
+	catch_signals();
 	code = http_post(work->http, "/v1/jobs", document, NULL, &job, err);
 	cJSON_Delete(document);
 	if (code == 0) {
 		snprintf(work->job, sizeof(work->job), "%s", member_text(job, "id", ""));
-		code = watch_job(work->http, work->job, stderr, err);
+		code = watch_job(work->http, work->job, stderr, check_job, work, err);
 	}
 	cJSON_Delete(job);
 	if (code != 0)
@@ -408,9 +526,6 @@ static int reproduce_run(const void *values, struct error *err)
 {
 	struct work work = {.options = values, .connection = ((const struct reproduce_options *)values)->http};
 	const char *folder = getenv("TMPDIR");
-	cJSON *removed = NULL;
-	struct error ignored;
-	char path[200];
 	int code;
 
 	snprintf(work.directory, sizeof(work.directory), "%.1000s/cbct-reproduce-XXXXXX",
@@ -425,17 +540,19 @@ static int reproduce_run(const void *values, struct error *err)
 		code = work.options->directory != NULL ? make_from_directory(&work, err) : make_on_daemon(&work, err);
 	if (code == 0)
 		code = compare(&work, err);
-	snprintf(path, sizeof(path), "/v1/jobs/%.100s", work.job);
-	if (work.job[0] != '\0' && !work.options->keep)
-		http_json(work.http, "DELETE", path, &removed, &ignored);
+	if (work.job[0] != '\0' && (!work.options->keep || work.given_up))
+		remove_job(&work);
 	else if (work.job[0] != '\0')
 		printf("job %s\n", work.job);
 	remove_files(&work);
 	http_free(work.http);
-	cJSON_Delete(removed);
 	cJSON_Delete(work.recipe);
 	provenance_clear(&work.was);
 	provenance_clear(&work.is);
+	if (interrupted != 0) {
+		fflush(stdout);
+		raise(interrupted);
+	}
 	return code;
 }
 

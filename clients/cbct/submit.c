@@ -59,7 +59,7 @@ static int submit(const struct submit_options *options, const cJSON *document, s
 		fflush(stdout);
 		/* On the other stream: `job=$(cbct submit ...)` takes the id alone. */
 		if (options->wait)
-			code = watch_job(http, id, stderr, err);
+			code = watch_job(http, id, stderr, NULL, NULL, err);
 	}
 	cJSON_Delete(job);
 	http_free(http);

@@ -36,6 +36,8 @@ struct view {
 	pthread_mutex_t lock; /* guards progress */
 	struct progress *progress;
 	atomic_bool failed;
+	watch_check check; /* watch_job's, constant as its context; NULL: none */
+	void *context;
 };
 
 /* Whether the program says when the job's iterations end. */
@@ -137,6 +139,8 @@ static int follow(struct http *http, const char *job, struct view *view, struct 
 		end = ended(member_text(document, "state", "?"));
 		if (end)
 			code = judge(document, err);
+		else if (view->check != NULL)
+			code = view->check(view->context, document, err);
 		cJSON_Delete(document);
 		/* The first answer at once; later ones after a second, or when the job ends. */
 		snprintf(path, sizeof(path), "/v1/jobs/%.100s?wait=1", job);
@@ -145,9 +149,12 @@ static int follow(struct http *http, const char *job, struct view *view, struct 
 	return code;
 }
 
-int watch_job(struct http *http, const char *job, FILE *to, struct error *err)
+int watch_job(struct http *http, const char *job, FILE *to, watch_check check, void *context, struct error *err)
 {
-	struct view view = {.lock = PTHREAD_MUTEX_INITIALIZER, .progress = progress_new(to, PROGRESS_OR_LINES, job)};
+	struct view view = {.lock = PTHREAD_MUTEX_INITIALIZER,
+			    .progress = progress_new(to, PROGRESS_OR_LINES, job),
+			    .check = check,
+			    .context = context};
 	int code = follow(http, job, &view, err);
 
 	progress_free(view.progress);
@@ -223,7 +230,7 @@ static int watch_run(const void *values, struct error *err)
 
 	if (code == 0)
 		code = options->directory != NULL ? watch_and_save(http, options, err)
-						  : watch_job(http, options->job, stdout, err);
+						  : watch_job(http, options->job, stdout, NULL, NULL, err);
 	http_free(http);
 	return code;
 }

@@ -113,6 +113,62 @@ test_a_changed_projection_is_named() {
 	! grep -q "^projections:" "$work/said" || fail "the projections are the same"
 }
 
+# gives_up WORDS: cbct reproduce ends by itself, with these words and without a job of its own
+gives_up() {
+	local status=0 before
+	req GET /v1/jobs
+	before=$(json '.jobs | length')
+	timeout 60 cbct reproduce "$work/final.nii" --scan "$scan" >"$work/said" 2>"$work/said.err" || status=$?
+	[ $status -ne 0 ] && [ $status -ne 124 ] || fail "status $status: $(tail -3 "$work/said.err")"
+	grep -qF -- "$1" "$work/said.err" || fail "$1 in: $(cat "$work/said.err")"
+	req GET /v1/jobs
+	[ "$(json '.jobs | length')" = "$before" ] || fail "a job is left behind: $(json '.jobs[0]')"
+}
+
+test_what_the_disk_has_damaged_is_named() {
+	local bytes=$((48 * 40 * $(jq 'if .projections.sample == "uint16" then 2 else 4 end' "$scan_dir/scan.json"))) k
+	post_scan "$scan_dir"
+	post_projections "$scan_dir"
+	for k in 4 11 12; do
+		printf '\125\252' | dd of="$state/scans/$scan/projections.raw" bs=1 seek=$((k * bytes + 700)) conv=notrunc status=none
+	done
+	gives_up "projections: 4, 11-12 of the scan $scan are not there, or damaged"
+	gives_up "projections: 4, 11-12 of the scan $scan are not there, or damaged" # known by now
+	timeout 60 cbct reproduce "$work/final.nii" --scan "$scan" --keep >"$work/said" 2>"$work/said.err" && fail "made of what is not there"
+	req GET "/v1/jobs?state=waiting"
+	expect_json '.jobs == []'
+	post_projections "$scan_dir"
+	again "$work/final.nii" --scan "$scan" || fail "sent again: $(cat "$work/said" "$work/said.err")"
+	said "the same bits"
+}
+
+test_a_command_that_is_ended_leaves_no_job() {
+	local signal pid status long end
+	req GET "/v1/scans?limit=1"
+	post_job "{\"scan\": \"$(json '.scans[0].id')\", \"grid\": {\"size\": [24, 24, 16], \"spacing_mm\": [4, 4, 4]}, \"sart\": {\"iterations\": 100000, \"subsets\": 5}}"
+	long=$job
+	state_becomes running
+	for signal in INT TERM; do
+		cbct reproduce "$work/final.nii" >"$work/said" 2>"$work/said.err" &
+		pid=$!
+		end=$((SECONDS + 30))
+		until req GET "/v1/jobs?state=queued" && [ "$(json '.jobs | length')" = 1 ]; do
+			[ $SECONDS -lt $end ] || fail "a queued job"
+			sleep 0.05
+		done
+		kill -$signal $pid
+		status=0
+		wait $pid || status=$?
+		[ $status = $((128 + $(kill -l $signal))) ] || fail "status $status of $signal"
+		req GET /v1/jobs
+		expect_json ".jobs | map(select(.id != \"$long\" and .id != \"$made\")) == []"
+	done
+	req DELETE "/v1/jobs/$long?wait=20"
+	expect_status 202
+	req DELETE "/v1/jobs/$long"
+	expect_status 204
+}
+
 test_a_changed_version_is_named() {
 	cp "$work/final.nii" "$work/version.nii"
 	in_header "$work/version.nii" "cbctd 1.0.0" "cbctd 1.0.9"
