@@ -227,9 +227,7 @@ START_TEST(finds_views_that_see_half_of_the_balls)
 	for (int k = 0; k < calibration.count; k++)
 		half += calibration.views[k].balls <= balls.count / 2;
 	ck_assert_int_ge(half, calibration.count / 3);
-	for (int k = 0; k < calibration.count; k++)
-		ck_assert_msg(calibration.views[k].used, "view %d: %s", k, calibration.views[k].refused);
-	ck_assert_double_le(calibration.rms, .2);
+	assert_found("half of the balls", &scene.arm, &calibration, .2);
 	calibration_clear(&calibration);
 	balls_clear(&balls);
 }
