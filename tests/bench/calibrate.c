@@ -3,7 +3,8 @@
  * what it is worth: how wide a wire of .2 mm along z is in the volume that FDK makes of the same views, with the
  * views that were found, with the true ones and, its maximum, with the circle's.
  *
- * Usage: calibrate [VIEWS]. The pictures are made beforehand and lie in memory (1.9 GB for 400); lines of JSON.
+ * Usage: calibrate [VIEWS [PHOTONS]], 0 photons for no noise. The pictures are made beforehand and lie in memory (1.9
+ * GB for 400); lines of JSON.
  */
 #include <math.h>
 #include <stdio.h>
@@ -224,7 +225,8 @@ int main(int argc, char **argv)
 	struct balls balls = {0};
 	struct calibrate_request request = {
 	    .nominal = &nominal, .pixel_mm = pixel_mm, .balls = &balls, .image = take_picture, .context = &pictures};
-	struct target target = {.balls = &balls, .ball = .8, .body = .02, .radius = 62, .photons = 20000};
+	struct target target = {
+	    .balls = &balls, .ball = .8, .body = .02, .radius = 62, .photons = argc > 2 ? atof(argv[2]) : 20000};
 	struct error err = {0};
 	int code = -1;
 
