@@ -202,7 +202,7 @@ static int take_out_again(const struct correction_job *job, struct metal *metal,
 
 /*
  * What is filled into the traces knows nothing of the object outside of the grid, and the model of that is made of the
- * traces: where the object goes on there, iterations with the stage had up to eight times the error beside metal of
+ * traces: where the object goes on there, iterations with the stage had up to twelve times the error beside metal of
  * those without it (tests/bench/results/metal.txt).
  */
 static void warn_of_outside(const struct correction_job *job)
