@@ -368,16 +368,16 @@ static int adjust_balls(struct run *run, struct error *err)
 	const struct balls *drawing = run->request->balls;
 	struct bundle_view *views = calloc((size_t)calibration->count, sizeof(*views));
 	double squares = 0;
-	int code;
+	int used = 0, code;
 
 	if (views == NULL)
 		return error_set(err, ERR_NO_MEMORY, "no memory for %d views", calibration->count);
 	for (int k = 0; k < calibration->count; k++)
 		if (calibration->views[k].used)
-			views[k] = (struct bundle_view){.pose = &run->works[k].pose,
-							.pairs = run->works[k].pairs,
-							.count = run->works[k].pair_count};
-	code = bundle_fit(views, calibration->count, run->request->pixel_mm, &calibration->balls, DRAWING_SIGMA, err);
+			views[used++] = (struct bundle_view){.pose = &run->works[k].pose,
+							     .pairs = run->works[k].pairs,
+							     .count = run->works[k].pair_count};
+	code = bundle_fit(views, used, run->request->pixel_mm, &calibration->balls, DRAWING_SIGMA, err);
 	free(views);
 	if (code < 0)
 		return code;
