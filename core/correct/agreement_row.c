@@ -203,4 +203,5 @@ const struct correction correction_agreement = {
     .close = close_row,
     .view = take_view,
     .warn = warn,
+    .warns_late = true,
 };

@@ -182,12 +182,12 @@ int corrections_apply(struct correction_chain *chain, enum correction_time time,
 	return code;
 }
 
-int corrections_warn(struct correction_chain *chain, struct error *err)
+int corrections_warn(struct correction_chain *chain, bool late, struct error *err)
 {
 	int code = 0;
 
 	for (int i = 0; i < CORRECTION_COUNT && code == 0; i++)
-		if (corrections[i]->warn != NULL && chain_has(chain, i))
+		if (corrections[i]->warn != NULL && corrections[i]->warns_late == late && chain_has(chain, i))
 			code = corrections[i]->warn(&chain->job, chain->state[i], err);
 	return code;
 }

@@ -137,6 +137,7 @@ struct correction {
 		     struct error *err);
 	/* Called once, when all views have come, but not in a resumed run: warns of what they showed. */
 	int (*warn)(const struct correction_job *job, void *state, struct error *err);
+	bool warns_late; /* that takes long and changes no volume, and does not keep FDK's waiting */
 
 	/*
 	 * Puts into a volume that is to be kept what belongs into the image only; `hide` takes it out again and
@@ -187,7 +188,8 @@ int corrections_take(struct correction_chain *chain, const void *samples, int vi
 		     struct error *err);
 /* Runs the corrections of a time that is not one of views; *ret_changed: the volume is another one now. */
 int corrections_apply(struct correction_chain *chain, enum correction_time time, bool *ret_changed, struct error *err);
-int corrections_warn(struct correction_chain *chain, struct error *err);
+/* Calls `warn` of the rows whose warns_late is `late`. */
+int corrections_warn(struct correction_chain *chain, bool late, struct error *err);
 int corrections_show(struct correction_chain *chain, double *ret_estimate_mm, struct error *err);
 void corrections_mark(const struct correction_chain *chain, struct correction_marks *marks);
 /* Draws which rays of a view are in the traces of what is very dense, [row][column]. */

@@ -553,6 +553,16 @@ int recon_lacks(struct recon *recon, bool *ret_lacks, struct error *err)
 	return code;
 }
 
+/* What takes long to find in the views is told once FDK's volume is kept, and of a resumed run it was. */
+static int warn_late(struct recon *recon, struct error *err)
+{
+	int code = recon->resumed ? 0 : corrections_warn(&recon->corrections, true, err);
+
+	if (code == 0 && recon->agreement.views > 0 && recon->hooks->agreement != NULL)
+		recon->hooks->agreement(recon->hooks->context, &recon->agreement);
+	return code;
+}
+
 int recon_run(struct recon *recon, struct error *err)
 {
 	const struct recipe *recipe = &recon->recipe;
@@ -569,9 +579,7 @@ int recon_run(struct recon *recon, struct error *err)
 	recon->ran = true;
 	if (!recon->resumed) {
 		warn_recipe(&recon->warnings, recon->geometry, &recon->orbit, recipe);
-		code = corrections_warn(&recon->corrections, err);
-		if (code == 0 && recon->agreement.views > 0 && recon->hooks->agreement != NULL)
-			recon->hooks->agreement(recon->hooks->context, &recon->agreement);
+		code = corrections_warn(&recon->corrections, false, err);
 	}
 	if (code == 0)
 		code = cancel_check(&recon->cancel, err);
@@ -580,10 +588,13 @@ int recon_run(struct recon *recon, struct error *err)
 	if (code == 0)
 		code = recon_runs_fdk(recon) ? finish_fdk(recon, err) : measure(recon, NULL, &recon->norms, err);
 	if (code == 0 && recipe->algorithm != NULL)
+		code = warn_late(recon, err);
+	if (code == 0 && recipe->algorithm != NULL)
 		code = run_iterations(recon, err);
 	if (code < 0)
 		return code;
 	recon->ended = true;
 	recon->work_done = recon->work_total; /* a stop rule may have ended it early */
-	return keep(recon, "final", stage, err);
+	code = keep(recon, "final", stage, err);
+	return code == 0 && recipe->algorithm == NULL ? warn_late(recon, err) : code;
 }

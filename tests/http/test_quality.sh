@@ -52,6 +52,11 @@ test_a_job_tells_whether_the_geometry_fits() {
 		expect_json "[.warnings[] | select(.code == \"geometry_wrong\" and .severity == \"serious\")] | (length == 0) == $fits"
 		expect_json '.warnings | all(.code != "geometry_doubtful")'
 		json .geometry_agreement >"$work/$name.agreement"
+		# FDK's volume does not wait for what takes long to find.
+		req GET "/v1/jobs/$job/events"
+		grep -E -A 2 '^event: (volume|warning)' "$body" | grep -o -E 'volumes/final|geometry_wrong' | uniq >"$work/order"
+		[ "$(cat "$work/order")" = "$($fits && echo volumes/final || printf 'volumes/final\ngeometry_wrong')" ] ||
+			fail "the volume, then the warning, got: $(cat "$work/order")"
 		req GET "/v1/scans/$scan"
 		expect_json ".derived.geometry_agreement == $(cat "$work/$name.agreement")"
 	done
