@@ -195,7 +195,7 @@ $(BUILD)/cbctd-without-postgresql: $(filter-out $(BUILD)/daemon/store/postgresql
 
 gpu_programs := $(BUILD)/gpu_check $(BUILD)/gpu_bench $(BUILD)/gpu_cards $(BUILD)/gpu_large
 # Every program that a test or a benchmark runs, so that none stops compiling unseen.
-test-programs: $(addprefix $(BUILD)/,unit member cbct-worker-held cbctd-held cbctd-without-postgresql manual faults.so clock.so every.so live_bytes.so simulated-nvml/libnvidia-ml.so.1 cpu-bench calibrate-bench agreement breathing refine denoise presets stopping methods watchers slices acquire paper-project rabbitct $(if $(postgresql),claims)) \
+test-programs: $(addprefix $(BUILD)/,unit member cbct-worker-held cbctd-held cbctd-without-postgresql manual faults.so clock.so every.so live_bytes.so simulated-nvml/libnvidia-ml.so.1 cpu-bench calibrate-bench phantoms agreement breathing refine denoise presets stopping methods watchers slices acquire paper-project rabbitct $(if $(postgresql),claims)) \
                $(if $(cuda_objects),$(gpu_programs) $(BUILD)/gpu_ceilings $(BUILD)/cbct-worker-faulty,$(call objects,$(wildcard tests/bench/gpu_*.c)))
 
 # What tests ask of JSON documents by the thousand.
@@ -258,6 +258,9 @@ $(BUILD)/refine: $(call objects,tests/bench/refine.c tests/bench/fdk_volume.c te
 	$(call say,LINK)$(CC) $(LDFLAGS) -o $@ $^ $(call pkg,--libs,$(core_libs)) $(if $(cuda_objects),$(cuda_libs)) $(LIBM)
 
 $(BUILD)/calibrate-bench: $(call objects,tests/bench/calibrate.c tests/bench/fdk_volume.c tests/unit/arm.c) $(library)
+	$(call say,LINK)$(CC) $(LDFLAGS) -o $@ $^ $(call pkg,--libs,$(core_libs)) $(LIBM)
+
+$(BUILD)/phantoms: $(call objects,tests/bench/phantoms.c tests/unit/arm.c) $(library)
 	$(call say,LINK)$(CC) $(LDFLAGS) -o $@ $^ $(call pkg,--libs,$(core_libs)) $(LIBM)
 
 # Claims of many workers at once in the ledger of a fleet.

@@ -2,56 +2,17 @@
 #include "core/calibrate/calibrate.h"
 
 #include <math.h>
-#include <stdarg.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
 
 #include "core/calibrate/internal.h"
-#include "core/select.h"
 
-enum { PAIRS_LEAST = 7 };                /* of a view: nine unknowns, and some balls to hold them against */
-static const double SHARE_LEAST = .4;    /* of the balls whose shadows should be on the picture */
-static const double RMS_MOST = 1;        /* pixels */
-static const double UNEVEN_FACTOR = 4;   /* of the median of the views' residuals */
-static const double UNEVEN_LEAST = .1;   /* pixels */
-static const double NEIGHBOUR_REACH = 4; /* mm at the detector, from a pose between the neighbours' */
 static const double DIAMETER_TOLERANCE = .15;
 static const double SCALE_TOLERANCE = .1; /* of the mean distance of the sources, against the nominal one */
 static const double COUNTS_LEAST = 30;    /* a line integral that no picture has as its median */
 static const double USED_LEAST = .75;     /* of the views */
-static const double CLEARANCE = 2;        /* pixels between two shadows that do not touch */
 static const double DRAWING_SIGMA = .1;   /* mm, of machining, where balls are adjusted */
-
-/* Findings in one view while the scan is calibrated. */
-struct work {
-	struct shadow *shadows; /* [count], owned */
-	struct shadow_facts facts;
-	struct pair *pairs; /* [pair_count], owned */
-	int count, pair_count;
-	struct pose pose;
-};
-
-struct run {
-	const struct calibrate_request *request;
-	struct calibration *calibration;
-	struct work *works;         /* [views] */
-	struct match_view *matches; /* [views] */
-	double least, most;         /* mm, the balls' diameters */
-};
-
-static void refuse(struct calibrated_view *view, const char *format, ...) __attribute__((format(printf, 2, 3)));
-
-/* A view is not used: why, in words. */
-static void refuse(struct calibrated_view *view, const char *format, ...)
-{
-	va_list arguments;
-
-	va_start(arguments, format);
-	vsnprintf(view->refused, sizeof(view->refused), format, arguments);
-	va_end(arguments);
-	view->used = false;
-}
 
 /* ---- pictures ---- */
 
@@ -146,220 +107,6 @@ static int check_pictures(const struct run *run, struct error *err)
 			 middle->facts.candidates - middle->count);
 }
 
-/* ---- a view ---- */
-
-/* Drops pairs whose shadows touch that of another ball: both centroids are wrong. */
-static int drop_overlaps(const struct run *run, const struct pose *pose, struct pair *pairs, int count)
-{
-	const struct balls *balls = &run->calibration->balls;
-	double places[BALLS_MOST][2], radii[BALLS_MOST];
-	int kept = 0;
-
-	for (int b = 0; b < balls->count; b++)
-		radii[b] = pose_shadow(pose, run->request->pixel_mm, &balls->ball[b], places[b]);
-	for (int i = 0; i < count; i++) {
-		const int own = pairs[i].ball;
-		bool clear = true;
-
-		for (int b = 0; b < balls->count && clear; b++)
-			clear = b == own || radii[b] == 0 ||
-				hypot(places[b][0] - places[own][0], places[b][1] - places[own][1]) >
-				    radii[b] + radii[own] + CLEARANCE;
-		if (clear)
-			pairs[kept++] = pairs[i];
-	}
-	return kept;
-}
-
-/* Drops pairs that are far off by the measure of the others. */
-static int drop_outliers(const struct run *run, const struct pose *pose, struct pair *pairs, int count)
-{
-	float off[BALLS_MOST], sorted[BALLS_MOST];
-	double limit;
-	int kept = 0;
-
-	for (int i = 0; i < count; i++)
-		off[i] = sorted[i] =
-		    (float)pose_rms(pose, run->request->pixel_mm, &run->calibration->balls, &pairs[i], 1, NULL);
-	limit = fmax(.1, 3.5 * select_kth(sorted, count, count / 2));
-	for (int i = 0; i < count; i++)
-		if (off[i] <= limit)
-			pairs[kept++] = pairs[i];
-	return kept;
-}
-
-/* Counts the balls whose shadows are wholly on the picture under a pose. */
-static int on_picture(const struct run *run, const struct pose *pose)
-{
-	const struct geometry *nominal = run->request->nominal;
-	const struct balls *balls = &run->calibration->balls;
-	int count = 0;
-
-	for (int b = 0; b < balls->count; b++) {
-		double pixel[2], radius = pose_shadow(pose, run->request->pixel_mm, &balls->ball[b], pixel);
-		const double edge = 1.5 * radius;
-
-		count += radius > 0 && pixel[0] > edge && pixel[1] > edge && pixel[0] < nominal->columns - 1 - edge &&
-			 pixel[1] < nominal->rows - 1 - edge;
-	}
-	return count;
-}
-
-/* Refines a view's pose step by step, with new pairs under each pose. Returns how many pairs are used. */
-static int refine(const struct run *run, int view, struct pose *pose, struct pair *pairs, int count)
-{
-	static const double reaches[] = {4, 2.5, 2.5};
-	const double *pixel_mm = run->request->pixel_mm;
-	const struct balls *balls = &run->calibration->balls;
-
-	pose_fit(pose, pixel_mm, balls, pairs, count);
-	for (int i = 0; i < 3; i++) {
-		count = match_pose(&run->matches[view], pose, pixel_mm, balls, reaches[i], pairs);
-		count = drop_overlaps(run, pose, pairs, count);
-		if (i > 0 && count >= PAIRS_LEAST)
-			count = drop_outliers(run, pose, pairs, count);
-		if (count < PAIRS_LEAST)
-			return count;
-		pose_fit(pose, pixel_mm, balls, pairs, count);
-	}
-	return count;
-}
-
-/* Residuals of a view that has its pose and pairs. */
-static void measure_view(const struct run *run, int view)
-{
-	struct calibrated_view *result = &run->calibration->views[view];
-	const struct work *work = &run->works[view];
-	const double isocentre[3] = {0};
-	double pixel[2];
-
-	result->balls = work->pair_count;
-	result->rms = pose_rms(&work->pose, run->request->pixel_mm, &run->calibration->balls, work->pairs,
-			       work->pair_count, &result->worst);
-	result->rms_isocentre = result->rms / pose_project(&work->pose, run->request->pixel_mm, isocentre, pixel);
-	pose_view(&work->pose, run->request->pixel_mm, &result->view);
-}
-
-/* Pairs of a view by the nominal geometry; on the second round by the pose between its neighbours'. */
-static int pair_view(const struct run *run, int view, double turn, bool again, struct pair *pairs)
-{
-	const double *pixel_mm = run->request->pixel_mm;
-	const struct balls *balls = &run->calibration->balls;
-	struct pose pose;
-
-	if (!again)
-		return match_view(&run->matches[view], pixel_mm, balls, turn, pairs);
-	pose_of_view(&pose, &run->calibration->views[view].view);
-	return match_pose(&run->matches[view], &pose, pixel_mm, balls, NEIGHBOUR_REACH / pixel_mm[0], pairs);
-}
-
-static void find_view(const struct run *run, int view, double turn, bool again, struct pair *pairs)
-{
-	const double *pixel_mm = run->request->pixel_mm;
-	const struct balls *balls = &run->calibration->balls;
-	struct calibrated_view *result = &run->calibration->views[view];
-	struct work *work = &run->works[view];
-	struct pose pose;
-	int matched = pair_view(run, view, turn, again, pairs), agreeing, used, expected;
-
-	if (matched < PAIRS_LEAST) {
-		refuse(result, "%d of its %d shadows are where %s and this phantom have balls, expected %d or more",
-		       matched, work->count, again ? "its neighbours" : "the nominal geometry", PAIRS_LEAST);
-		return;
-	}
-	if (resect(balls, pairs, matched, pixel_mm, (unsigned)view, &pose, &agreeing) < 0) {
-		refuse(result, "no pose of source and detector explains six of its %d shadows", matched);
-		return;
-	}
-	result->rms = pose_fit(&pose, pixel_mm, balls, pairs, agreeing);
-	used = refine(run, view, &pose, pairs, agreeing);
-	expected = on_picture(run, &pose);
-	if (used < PAIRS_LEAST || used < SHARE_LEAST * expected) {
-		refuse(
-		    result,
-		    "one pose explains %d of its %d shadows, of the %d balls that it should show, with a residual of "
-		    "%.2f pixels over %d shadows before",
-		    used, work->count, expected, result->rms, agreeing);
-		return;
-	}
-	work->pose = pose;
-	work->pair_count = used;
-	memcpy(work->pairs, pairs, (size_t)used * sizeof(*pairs));
-	measure_view(run, view);
-	result->used = true;
-	result->refused[0] = '\0';
-	if (result->rms > RMS_MOST)
-		refuse(result, "its residual is %.2f pixels, expected at most %g", result->rms, RMS_MOST);
-}
-
-/*
- * Refuses views whose residual is far above the others': shadows taken for other balls' leave some tenths of a pixel
- * where a true pose leaves hundredths.
- */
-static int refuse_uneven(const struct run *run, struct error *err)
-{
-	const int count = run->calibration->count;
-	float *all = malloc((size_t)count * sizeof(*all));
-	double limit;
-	int used = 0;
-
-	if (all == NULL)
-		return error_set(err, ERR_NO_MEMORY, "no memory for %d views", count);
-	for (int k = 0; k < count; k++)
-		if (run->calibration->views[k].used)
-			all[used++] = (float)run->calibration->views[k].rms;
-	limit = used > 0 ? fmax(UNEVEN_LEAST, UNEVEN_FACTOR * select_kth(all, used, used / 2)) : 0;
-	for (int k = 0; k < count; k++) {
-		struct calibrated_view *view = &run->calibration->views[k];
-
-		if (view->used && view->rms > limit)
-			refuse(view, "its residual is %.2f pixels, expected at most %.2f by those of the other views",
-			       view->rms, limit);
-	}
-	free(all);
-	return 0;
-}
-
-/* Tries all views that are not used yet. */
-static int find_round(const struct run *run, double turn, bool again, struct error *err)
-{
-	int failed = 0;
-
-#pragma omp parallel
-	{
-		struct pair *pairs = malloc(BALLS_MOST * sizeof(*pairs));
-
-		if (pairs == NULL) {
-#pragma omp atomic write
-			failed = 1;
-		}
-#pragma omp for schedule(dynamic)
-		for (int k = 0; k < run->calibration->count; k++)
-			if (pairs != NULL && !run->calibration->views[k].used)
-				find_view(run, k, turn, again, pairs);
-		free(pairs);
-	}
-	return failed ? error_set(err, ERR_NO_MEMORY, "no memory for the pairs of a view") : 0;
-}
-
-/*
- * The first round begins from the nominal geometry; views that it refused begin once more, from where their neighbours
- * stand.
- * The search for a pose only begins there: the view's own shadows alone say where it ends.
- */
-static int find_views(struct run *run, double turn, struct error *err)
-{
-	int code = find_round(run, turn, false, err);
-
-	if (code == 0)
-		code = refuse_uneven(run, err);
-	if (code == 0)
-		code = sweep_fill(run->calibration, run->request->nominal, err);
-	if (code == 0)
-		code = find_round(run, turn, true, err);
-	return code == 0 ? refuse_uneven(run, err) : code;
-}
-
 /* ---- all views ---- */
 
 static int adjust_balls(struct run *run, struct error *err)
@@ -418,44 +165,30 @@ static int summarise(struct run *run, struct error *err)
 {
 	struct calibration *calibration = run->calibration;
 	const struct geometry *nominal = run->request->nominal;
-	double squares = 0, squares_isocentre = 0, along = 0, across = 0;
-	size_t count = 0, taken = 0;
-	float *ratios;
+	double squares = 0, squares_isocentre = 0, along = 0, across = 0, count = 0;
 
 	calibration->used = 0;
-	for (int k = 0; k < calibration->count; k++)
-		count += calibration->views[k].used ? (size_t)run->works[k].pair_count : 0;
-	ratios = malloc((count + 1) * sizeof(*ratios));
-	if (ratios == NULL)
-		return error_set(err, ERR_NO_MEMORY, "no memory for %zu shadows", count);
 	for (int k = 0; k < calibration->count; k++) {
 		const struct calibrated_view *view = &calibration->views[k];
-		const struct work *work = &run->works[k];
 		const double *is = view->view.source, *was = nominal->views[k].source;
+		const double pairs = run->works[k].pair_count;
 
 		if (!view->used)
 			continue;
 		calibration->used++;
 		along += is[0] * was[0] + is[1] * was[1];
 		across += is[0] * was[1] - is[1] * was[0];
-		squares += view->rms * view->rms * work->pair_count;
-		squares_isocentre += view->rms_isocentre * view->rms_isocentre * work->pair_count;
-		for (int i = 0; i < work->pair_count; i++) {
-			double pixel[2], radius = pose_shadow(&work->pose, run->request->pixel_mm,
-							      &calibration->balls.ball[work->pairs[i].ball], pixel);
-
-			ratios[taken++] = (float)(work->shadows[work->pairs[i].shadow].radius / radius);
-		}
+		squares += view->rms * view->rms * pairs;
+		squares_isocentre += view->rms_isocentre * view->rms_isocentre * pairs;
+		count += pairs;
 	}
-	if (taken > 0) {
-		calibration->rms = sqrt(squares / (double)count);
-		calibration->rms_isocentre = sqrt(squares_isocentre / (double)count);
-		calibration->turn = atan2(across, along);
-		calibration->distance_ratio = scale_ratio(run);
-		calibration->diameter_ratio = select_kth(ratios, (int)taken, (int)taken / 2);
-	}
-	free(ratios);
-	return 0;
+	if (count == 0)
+		return 0;
+	calibration->rms = sqrt(squares / count);
+	calibration->rms_isocentre = sqrt(squares_isocentre / count);
+	calibration->turn = atan2(across, along);
+	calibration->distance_ratio = scale_ratio(run);
+	return diameters_measure(run, &calibration->diameter_ratio, err);
 }
 
 /* The view whose refusal stands for the others': the one with the middle residual. */

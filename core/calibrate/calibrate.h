@@ -13,7 +13,10 @@
  *   match.c    which shadow is of which ball: votes with the nominal geometry             (shadows -> pairs)
  *   resect.c   a view from its pairs: RANSAC over the normalised DLT                      (pairs -> a first pose)
  *   pose.c     a view's nine numbers by Levenberg-Marquardt                               (pairs -> pose)
+ *   touching.c shadows that touch, fitted together, where few stand clear          (an image, a pose -> pairs)
+ *   view.c     all of these for each view
  *   bundle.c   all views and the balls' own places at once, where that is asked for
+ *   diameters.c  the balls' diameters against the drawing's
  *   sweep.c    views that do not follow their neighbours; poses between calibrated ones
  *
  * The world's frame of the result is the one that the balls' coordinates are given in: with the phantom's axis on the

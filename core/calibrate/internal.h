@@ -59,15 +59,15 @@ void pose_view(const struct pose *pose, const double pixel_mm[2], struct view *r
 double pose_project(const struct pose *pose, const double pixel_mm[2], const double point[3], double ret_pixel[2]);
 /*
  * Where the centroid of a ball's shadow lies: its centre's projection and the part by which the ellipse's is further
- * out. Returns the radius in pixels.
+ * out. Returns the radius in pixels, of the circle that has the ellipse's area.
  */
 double pose_shadow(const struct pose *pose, const double pixel_mm[2], const struct ball *ball, double ret_pixel[2]);
 
 /* A ball and its shadow in one view. */
 struct pair {
 	int ball;
-	int shadow; /* its index in the view's list */
-	double pixel[2];
+	int shadow;              /* its index in the view's list; -1: fitted together with others (touching.c) */
+	double pixel[2], radius; /* of its shadow */
 };
 
 /* Residuals' Jacobian of a ball in a view: by the pose's nine steps and by the ball's place. */
@@ -117,6 +117,15 @@ int match_pose(const struct match_view *view, const struct pose *pose, const dou
 int match_turn(const struct match_view *views, int count, const double pixel_mm[2], const struct balls *balls,
 	       double *ret_turn, double *ret_rival, struct error *err);
 
+/* ---- touching.c ---- */
+/*
+ * The places of balls' shadows that touch, from a pose that has each within about a radius of its own: each with those
+ * beside it, by what their thicknesses together let through. Writes a pair, of no shadow in the view's list, for each
+ * ball that is wholly on the picture, of this shape, and whose place the picture determines; returns how many.
+ */
+int touching_fit(const struct match_view *view, const float *image, const struct pose *pose, const double pixel_mm[2],
+		 const struct balls *balls, struct pair *ret_pairs);
+
 /* ---- bundle.c ---- */
 struct bundle_view {
 	struct pose *pose;
@@ -129,6 +138,38 @@ struct bundle_view {
  */
 int bundle_fit(const struct bundle_view *views, int count, const double pixel_mm[2], struct balls *balls,
 	       double drawing, struct error *err);
+
+/* ---- view.c ---- */
+enum { PAIRS_LEAST = 7 }; /* of a view: nine unknowns, and some balls to hold them against */
+
+/* Findings in one view while the scan is calibrated. */
+struct work {
+	struct shadow *shadows; /* [count], owned */
+	struct shadow_facts facts;
+	struct pair *pairs; /* [pair_count], owned, of as many as there are balls */
+	int count, pair_count;
+	struct pose pose;
+};
+
+struct run {
+	const struct calibrate_request *request;
+	struct calibration *calibration;
+	struct work *works;         /* [views] */
+	struct match_view *matches; /* [views] */
+	double least, most;         /* mm, the balls' diameters */
+};
+
+/* Pose and pairs of each view that can be used, the phantom turned about z by an angle; of the others the reason. */
+int find_views(struct run *run, double turn, struct error *err);
+/* Residuals of a view that has its pose and pairs. */
+void measure_view(const struct run *run, int view);
+
+/* ---- diameters.c ---- */
+/*
+ * The ratio of the shadows' diameters to the expected ones: the median over some of the views that are used, by the
+ * balls' thicknesses and whatever blurs them. There is a view that is used.
+ */
+int diameters_measure(const struct run *run, double *ret_ratio, struct error *err);
 
 /* ---- sweep.c ---- */
 /*

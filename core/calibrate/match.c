@@ -111,6 +111,7 @@ static int pair_up(const struct task *task, const double (*places)[2], double re
 		if (nearest[ret_pairs[i].shadow] != ret_pairs[i].ball)
 			continue;
 		ret_pairs[kept] = ret_pairs[i];
+		ret_pairs[kept].radius = view->shadows[ret_pairs[i].shadow].radius;
 		ret_pairs[kept].pixel[0] = view->shadows[ret_pairs[i].shadow].column;
 		ret_pairs[kept++].pixel[1] = view->shadows[ret_pairs[i].shadow].row;
 	}

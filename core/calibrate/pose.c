@@ -96,7 +96,9 @@ double pose_shadow(const struct pose *pose, const double pixel_mm[2], const stru
 	further = 1 + .2 * ball->diameter * ball->diameter / (ray[2] * ray[2]);
 	for (int i = 0; i < 2; i++)
 		ret_pixel[i] = (ray[i] * scale * further - pose->detector[i]) / pixel_mm[i];
-	return .5 * ball->diameter * scale / pixel_mm[0];
+	/* Along the line out of the piercing point the ellipse is sqrt(1 + T^2) times as long as across. */
+	return .5 * ball->diameter * scale / pixel_mm[0] *
+	       pow(1 + (ray[0] * ray[0] + ray[1] * ray[1]) / (ray[2] * ray[2]), .25);
 }
 
 double ball_shadow(const struct view *view, const struct ball *ball, double ret_pixel[2])

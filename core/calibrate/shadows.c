@@ -18,6 +18,8 @@
 enum { BLOCK_RADIUS = 2 }; /* blocks, at least, of the smallest ball: for its maximum to stand out */
 enum { RING_MOST = 1024 }; /* pixels of a ring that are looked at */
 enum { BUMPS_MOST = 8192 };
+enum { RAYS = 4 };                      /* along either side of a pixel, of small shadows */
+static const double RADIUS_FINE = 4;    /* pixels: from there on a chord at a pixel's middle is as good as its mean */
 enum { BLOCKS_MEASURED = 5000 };        /* of the image of block means: their median is known to .02 of the noise */
 static const double NOISE_FACTOR = 6;   /* a candidate's height, of the noise */
 static const double HEIGHT_LEAST = .01; /* line integral: below it nothing is a ball */
@@ -355,6 +357,20 @@ static bool take_moments(const struct shadow_finder *finder, const float *image,
 	return m.mass > 0;
 }
 
+/* A ball's chord, 1 in its middle, as the pixel at dx, dy from there has it. */
+static double chord_of(double dx, double dy, double radius)
+{
+	const int rays = radius < RADIUS_FINE ? RAYS : 1;
+	double sum = 0;
+
+	for (int i = 0; i < rays * rays; i++) {
+		const double x = dx + (i % rays + .5) / rays - .5, y = dy + (i / rays + .5) / rays - .5;
+
+		sum += sqrt(fmax(0, 1 - (x * x + y * y) / (radius * radius)));
+	}
+	return sum / (rays * rays);
+}
+
 /* Sums over a window of values, of a ball's chord lengths there (1 in the middle), and of what noise adds. */
 struct agreement {
 	double count, sum, squares, chords, both, noise;
@@ -373,7 +389,7 @@ static void take_agreement(const struct shadow_finder *finder, const float *imag
 
 			if (square > window * window)
 				continue;
-			chord = sqrt(fmax(0, 1 - square / (radius * radius)));
+			chord = chord_of(dx, dy, radius);
 			value = image[(size_t)y * (size_t)finder->columns + (size_t)x] - plane->at - plane->by_x * dx -
 				plane->by_y * dy;
 			sums.count++;

@@ -133,6 +133,27 @@ test_a_sagging_arm_is_calibrated_and_its_scans_use_it() {
 	stop_daemon
 }
 
+# Pixels of 2.54 mm, the means of 16 rays each: shadows of 2 to 4 pixels, most of which touch or cover others'.
+test_shadows_that_touch_are_told_apart() {
+	local fine=(--columns 600 --rows 480 --pixel .635 --sag daly) row found
+	start_daemon
+	for row in "12 3.2 13" "12 6 16" "8 4 13"; do
+		set -- $row
+		jq -nc --argjson balls "$1" --argjson ball "$2" '{kind: "circles", balls: $balls, diameter_mm: 110, distance_mm: 90, ball_mm: $ball, shift_deg: 15}' >"$work/touching.json"
+		cbct simulate -o "$work/fine" --balls "$work/touching.json" --density .6 "${fine[@]}" --views "$3"
+		cbct simulate -o "$work/truth" --phantom ball --scale 2 "${fine[@]}" --views "$3" --kind matrices
+		/usr/bin/python3 "$here/rays.py" "$work/fine" "$work/touching" 4 20000
+		balls=$(cbct upload "$work/touching" | head -1)
+		req POST /v1/calibrations "${json[@]}" "{\"scan\": \"$balls\", \"phantom\": $(cat "$work/touching.json")}"
+		expect_status 202
+		req GET "$(jq -r .href "$body")?wait=60"
+		expect_json ".state == \"succeeded\" and .used == $3 and .residual_pixels < .1 and (.diameter_ratio - 1 | fabs) < .01"
+		found=$(/usr/bin/python3 "$here/rays.py" compare "$body" "$work/truth/scan.json" 4)
+		expect_number "$found" '<' .2 "pixels by which $row are wrong"
+	done
+	stop_daemon
+}
+
 test_they_count_among_the_jobs_and_the_bytes() {
 	local phantom='{"kind": "circles", "balls": 12, "diameter_mm": 110, "distance_mm": 90, "ball_mm": 3.2, "shift_deg": 15}' before ask
 	rm -rf "$state"

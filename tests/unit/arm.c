@@ -187,24 +187,72 @@ static double counts(uint64_t *state, double mean)
 	return count;
 }
 
+/* Line integrals through the middles of the view's pixels. */
+static void take_lines(const struct arm *arm, const struct target *target, const struct view *stand, float *ret_picture)
+{
+	const size_t pixels = (size_t)arm->columns * (size_t)arm->rows;
+
+	memset(ret_picture, 0, pixels * sizeof(*ret_picture));
+	for (size_t i = 0; i < pixels && target->body > 0; i++) {
+		double way[3];
+
+		ray_of(stand, (double)(i % (size_t)arm->columns), (double)(i / (size_t)arm->columns), way);
+		ret_picture[i] = (float)(target->body * through_cylinder(stand->source, way, target->radius));
+	}
+	for (int b = 0; b < target->balls->count; b++)
+		if (target->missing == 0 || b % target->missing != 1)
+			add_ball(arm, stand, &target->balls->ball[b], target->ball, ret_picture);
+	if (target->metal)
+		add_metal(arm, stand, ret_picture);
+}
+
+/* What a pixel is that adds up the intensities of several rays: those of a finer detector in the same place. */
+static void take_means(const struct arm *arm, const struct target *target, const struct view *stand, float *ret_picture)
+{
+	const int rays = target->rays, columns = rays * arm->columns;
+	struct arm fine = *arm;
+	struct view finer = *stand;
+	float *picture;
+
+	fine.columns *= rays;
+	fine.rows *= rays;
+	fine.pixel /= rays;
+	for (int a = 0; a < 3; a++) {
+		finer.column_step[a] /= rays;
+		finer.row_step[a] /= rays;
+		finer.pixel0[a] -= .5 * (rays - 1) * (finer.column_step[a] + finer.row_step[a]);
+	}
+	picture = malloc((size_t)columns * (size_t)fine.rows * sizeof(*picture));
+	if (picture == NULL)
+		abort();
+	take_lines(&fine, target, &finer, picture);
+	for (int i = 0; i < arm->columns * arm->rows; i++) {
+		const int reach = (int)lround(.5 * target->blur * rays), wide = rays + 2 * reach;
+		double sum = 0;
+
+		for (int k = 0; k < wide * wide; k++) {
+			const int x = i % arm->columns * rays - reach + k % wide;
+			const int y = i / arm->columns * rays - reach + k / wide;
+
+			sum += x < 0 || y < 0 || x >= columns || y >= fine.rows
+				   ? 1
+				   : exp(-picture[(size_t)y * (size_t)columns + (size_t)x]);
+		}
+		ret_picture[i] = (float)-log(sum / (wide * wide));
+	}
+	free(picture);
+}
+
 void arm_picture(const struct arm *arm, const struct target *target, int view, float *ret_picture)
 {
 	const size_t pixels = (size_t)arm->columns * (size_t)arm->rows;
 	const struct view stand = arm_view(arm, view);
 	uint64_t state = (uint64_t)view * 1299709u + arm->seed + 5;
 
-	memset(ret_picture, 0, pixels * sizeof(*ret_picture));
-	for (size_t i = 0; i < pixels && target->body > 0; i++) {
-		double way[3];
-
-		ray_of(&stand, (double)(i % (size_t)arm->columns), (double)(i / (size_t)arm->columns), way);
-		ret_picture[i] = (float)(target->body * through_cylinder(stand.source, way, target->radius));
-	}
-	for (int b = 0; b < target->balls->count; b++)
-		if (target->missing == 0 || b % target->missing != 1)
-			add_ball(arm, &stand, &target->balls->ball[b], target->ball, ret_picture);
-	if (target->metal)
-		add_metal(arm, &stand, ret_picture);
+	if (target->rays > 1)
+		take_means(arm, target, &stand, ret_picture);
+	else
+		take_lines(arm, target, &stand, ret_picture);
 	for (size_t i = 0; i < pixels && target->photons > 0; i++)
 		ret_picture[i] =
 		    (float)-log(fmax(.5, counts(&state, target->photons * exp(-ret_picture[i]))) / target->photons);

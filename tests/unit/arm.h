@@ -32,6 +32,8 @@ struct target {
 	int missing;         /* of every so-many-th ball nothing is there; 0: all are */
 	bool metal;          /* a clip of metal and a cable */
 	double photons;      /* for each pixel in air; 0: no noise */
+	double blur;         /* pixels, by which the rays of a pixel reach further than its side, with several rays */
+	int rays;            /* along either side of a pixel, whose intensities it adds up; 0: one through its middle */
 };
 
 /* Line integrals of a view, [row][column]. */

@@ -233,6 +233,103 @@ START_TEST(finds_views_that_see_half_of_the_balls)
 }
 END_TEST
 
+/*
+ * Panels of coarse pixels, each of which adds up the intensities of 25 rays: shadows of 2 to 4 pixels, most of which
+ * touch or cover others'. The last phantom has half of its balls in pairs, 6.4 mm from centre to centre.
+ */
+static const struct {
+	const char *what;
+	int columns, rows, views, balls; /* of each circle */
+	double pixel, ball, blur, body;
+	bool pairs;
+} coarse[] = {
+    {"balls of 6 mm", 150, 120, 13, 12, 2.54, 6, 0, 0, false},
+    {"balls of 3.2 mm", 150, 120, 13, 12, 2.54, 3.2, 0, 0, false},
+    {"balls of 3.2 mm in a body", 150, 120, 16, 12, 2.54, 3.2, 0, .02, false},
+    {"a detector that blurs", 150, 120, 14, 9, 2.54, 5, .8, .02, false},
+    {"few balls", 150, 120, 13, 8, 2.54, 4, 0, 0, false},
+    {"pairs of balls", 200, 160, 16, 12, 1.9, 4, 0, 0, true},
+};
+
+START_TEST(shadows_that_touch_are_told_apart)
+{
+	struct scene scene = {.arm = arm_sagging};
+	struct ball_circles drawn = circles;
+	struct balls balls;
+	struct calibration calibration;
+	struct error err = {0};
+
+	drawn.balls = coarse[_i].balls;
+	drawn.ball = coarse[_i].ball;
+	drawn.first = 0;
+	drawn.shift = M_PI / drawn.balls;
+	ck_assert(balls_circles(&balls, &drawn, &err) == 0);
+	for (int b = 0; b < balls.count && coarse[_i].pairs; b += 4)
+		for (int a = 0; a < 3; a++)
+			balls.ball[b + 1].centre[a] = balls.ball[b].centre[a] + (a == 2 ? 3 : b % 8 == 0 ? 4 : -4);
+	scene.arm.columns = coarse[_i].columns;
+	scene.arm.rows = coarse[_i].rows;
+	scene.arm.pixel = coarse[_i].pixel;
+	scene.arm.count = coarse[_i].views;
+	scene.arm.first = 0;
+	scene.arm.step = 2 * M_PI / scene.arm.count;
+	scene.target = (struct target){.balls = &balls,
+				       .ball = .6,
+				       .body = coarse[_i].body,
+				       .radius = 62,
+				       .photons = 20000,
+				       .blur = coarse[_i].blur,
+				       .rays = 5};
+	ck_assert_msg(run(&scene, &balls, false, &calibration, &err) == 0, "%s: %s", coarse[_i].what, err.text);
+	assert_found(coarse[_i].what, &scene.arm, &calibration, .1);
+	/* A right drawing has the right diameters, whatever a pixel's side and the detector's blur add. */
+	ck_assert_msg(fabs(calibration.diameter_ratio - 1) <= .015, "%s: diameters of %.4f", coarse[_i].what,
+		      calibration.diameter_ratio);
+	calibration_clear(&calibration);
+	balls_clear(&balls);
+}
+END_TEST
+
+/*
+ * Two balls whose shadows cover each other, nearer and nearer: the pose has both half a pixel aside, and each place
+ * that is told is where the ball's shadow is. Where nearly all of one is in the other none may be told, and a third
+ * beside them, alone, always is.
+ */
+START_TEST(shadows_that_cover_each_other_are_fitted_together)
+{
+	const struct arm arm = {.columns = 60, .rows = 60, .count = 1, .pixel = 2.54, .sag = 0, .seed = 3};
+	const double pixel_mm[2] = {arm.pixel, arm.pixel}, apart = .5 * (8 - _i);
+	struct ball ball[] = {
+	    {{0, 0, 0}, 6}, {{0, apart, .3 * apart}, 6}, {{0, -20, 18}, 6}}; /* mm, across the view's rays */
+	const struct balls balls = {.count = 3, .ball = ball};
+	const struct target target = {.balls = &balls, .ball = .6, .photons = 20000, .rays = 8};
+	const struct view truth = arm_view(&arm, 0);
+	struct match_view view = {.columns = arm.columns, .rows = arm.rows};
+	float image[60 * 60];
+	struct pair pairs[3];
+	struct pose pose, aside;
+	int count, known = 0;
+
+	arm_picture(&arm, &target, 0, image);
+	pose_of_view(&pose, &truth);
+	aside = pose;
+	aside.detector[0] += .5 * arm.pixel;
+	count = touching_fit(&view, image, &aside, pixel_mm, &balls, pairs);
+	for (int i = 0; i < count; i++) {
+		double pixel[2];
+
+		pose_shadow(&pose, pixel_mm, &ball[pairs[i].ball], pixel);
+		ck_assert_msg(hypot(pixel[0] - pairs[i].pixel[0], pixel[1] - pairs[i].pixel[1]) <= .15,
+			      "%.1f mm apart, ball %d: at %.2f %.2f, expected %.2f %.2f", apart, pairs[i].ball,
+			      pairs[i].pixel[0], pairs[i].pixel[1], pixel[0], pixel[1]);
+		known += pairs[i].ball < 2;
+	}
+	ck_assert_int_eq(count - known, 1);
+	if (apart >= 2)
+		ck_assert_int_eq(known, 2);
+}
+END_TEST
+
 /* Puts a phantom down beside its place: turned about z, then about x, then moved. */
 static void put_down(struct balls *balls, double turn, double tilt, const double shift[3])
 {
@@ -587,6 +684,8 @@ Suite *calibrate_suite(void)
 	tcase_add_loop_test(tests, finds_views_of_a_sagging_arm, 0, sizeof(rows) / sizeof(*rows));
 	tcase_add_test(tests, the_centroid_of_an_ellipse_is_known);
 	tcase_add_test(tests, finds_views_that_see_half_of_the_balls);
+	tcase_add_loop_test(tests, shadows_that_touch_are_told_apart, 0, sizeof(coarse) / sizeof(*coarse));
+	tcase_add_loop_test(tests, shadows_that_cover_each_other_are_fitted_together, 0, 8);
 	tcase_add_loop_test(tests, a_phantom_beside_its_place_is_taken_for_no_other, 0,
 			    sizeof(beside) / sizeof(*beside));
 	tcase_add_test(tests, a_code_that_reads_the_same_backwards_is_refused);

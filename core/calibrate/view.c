@@ -1,0 +1,343 @@
+/*
+ * A view from its shadows: pairs by the nominal geometry or the neighbours' poses, a first pose, and that pose refined,
+ * by the centroids of shadows that stand clear and, where these are few, by all that are fitted together.
+ */
+#include <math.h>
+#include <stdarg.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+
+#include "core/calibrate/internal.h"
+#include "core/select.h"
+
+static const double SHARE_LEAST = .4;    /* of the balls whose shadows should be on the picture */
+static const double CLEAR_LEAST = .75;   /* of them, below which those that touch are fitted, too */
+static const double RMS_MOST = 1;        /* pixels */
+static const double UNEVEN_FACTOR = 4;   /* of the median of the views' residuals */
+static const double UNEVEN_LEAST = .1;   /* pixels */
+static const double NEIGHBOUR_REACH = 4; /* mm at the detector, from a pose between the neighbours' */
+static const double CLEARANCE = 2;       /* pixels between two shadows that do not touch */
+
+static void refuse(struct calibrated_view *view, const char *format, ...) __attribute__((format(printf, 2, 3)));
+
+/* A view is not used: why, in words. */
+static void refuse(struct calibrated_view *view, const char *format, ...)
+{
+	va_list arguments;
+
+	va_start(arguments, format);
+	vsnprintf(view->refused, sizeof(view->refused), format, arguments);
+	va_end(arguments);
+	view->used = false;
+}
+
+/* Drops pairs whose shadows touch that of another ball: both centroids are wrong. */
+static int drop_overlaps(const struct run *run, const struct pose *pose, struct pair *pairs, int count)
+{
+	const struct balls *balls = &run->calibration->balls;
+	double places[BALLS_MOST][2], radii[BALLS_MOST];
+	int kept = 0;
+
+	for (int b = 0; b < balls->count; b++)
+		radii[b] = pose_shadow(pose, run->request->pixel_mm, &balls->ball[b], places[b]);
+	for (int i = 0; i < count; i++) {
+		const int own = pairs[i].ball;
+		bool clear = true;
+
+		for (int b = 0; b < balls->count && clear; b++)
+			clear = b == own || radii[b] == 0 ||
+				hypot(places[b][0] - places[own][0], places[b][1] - places[own][1]) >
+				    radii[b] + radii[own] + CLEARANCE;
+		if (clear)
+			pairs[kept++] = pairs[i];
+	}
+	return kept;
+}
+
+/* Drops pairs that are far off by the measure of the others. */
+static int drop_outliers(const struct run *run, const struct pose *pose, struct pair *pairs, int count)
+{
+	float off[BALLS_MOST], sorted[BALLS_MOST];
+	double limit;
+	int kept = 0;
+
+	for (int i = 0; i < count; i++)
+		off[i] = sorted[i] =
+		    (float)pose_rms(pose, run->request->pixel_mm, &run->calibration->balls, &pairs[i], 1, NULL);
+	limit = fmax(.1, 3.5 * select_kth(sorted, count, count / 2));
+	for (int i = 0; i < count; i++)
+		if (off[i] <= limit)
+			pairs[kept++] = pairs[i];
+	return kept;
+}
+
+/* Counts the balls whose shadows are wholly on the picture under a pose. */
+static int on_picture(const struct run *run, const struct pose *pose)
+{
+	const struct geometry *nominal = run->request->nominal;
+	const struct balls *balls = &run->calibration->balls;
+	int count = 0;
+
+	for (int b = 0; b < balls->count; b++) {
+		double pixel[2], radius = pose_shadow(pose, run->request->pixel_mm, &balls->ball[b], pixel);
+		const double edge = 1.5 * radius;
+
+		count += radius > 0 && pixel[0] > edge && pixel[1] > edge && pixel[0] < nominal->columns - 1 - edge &&
+			 pixel[1] < nominal->rows - 1 - edge;
+	}
+	return count;
+}
+
+/* Refines a view's pose step by step, with new pairs under each pose. Returns how many pairs are used. */
+static int refine(const struct run *run, int view, struct pose *pose, struct pair *pairs, int count)
+{
+	static const double reaches[] = {4, 2.5, 2.5};
+	const double *pixel_mm = run->request->pixel_mm;
+	const struct balls *balls = &run->calibration->balls;
+
+	pose_fit(pose, pixel_mm, balls, pairs, count);
+	for (int i = 0; i < 3; i++) {
+		count = match_pose(&run->matches[view], pose, pixel_mm, balls, reaches[i], pairs);
+		count = drop_overlaps(run, pose, pairs, count);
+		if (i > 0 && count >= PAIRS_LEAST)
+			count = drop_outliers(run, pose, pairs, count);
+		if (count < PAIRS_LEAST)
+			return count;
+		pose_fit(pose, pixel_mm, balls, pairs, count);
+	}
+	return count;
+}
+
+/* Residuals of a view that has its pose and pairs. */
+void measure_view(const struct run *run, int view)
+{
+	struct calibrated_view *result = &run->calibration->views[view];
+	const struct work *work = &run->works[view];
+	const double isocentre[3] = {0};
+	double pixel[2];
+
+	result->balls = work->pair_count;
+	result->rms = pose_rms(&work->pose, run->request->pixel_mm, &run->calibration->balls, work->pairs,
+			       work->pair_count, &result->worst);
+	result->rms_isocentre = result->rms / pose_project(&work->pose, run->request->pixel_mm, isocentre, pixel);
+	pose_view(&work->pose, run->request->pixel_mm, &result->view);
+}
+
+/* Pairs of a view by the nominal geometry; on the second round by the pose between its neighbours'. */
+static int pair_view(const struct run *run, int view, double turn, bool again, struct pair *pairs)
+{
+	const double *pixel_mm = run->request->pixel_mm;
+	const struct balls *balls = &run->calibration->balls;
+	struct pose pose;
+
+	if (!again)
+		return match_view(&run->matches[view], pixel_mm, balls, turn, pairs);
+	pose_of_view(&pose, &run->calibration->views[view].view);
+	return match_pose(&run->matches[view], &pose, pixel_mm, balls, NEIGHBOUR_REACH / pixel_mm[0], pairs);
+}
+
+/* The same of all shadows, those that touch fitted together, under each pose anew. */
+static int refine_touching(const struct run *run, int view, const float *image, struct pose *pose, struct pair *pairs)
+{
+	enum { ROUNDS = 3 };
+	const double *pixel_mm = run->request->pixel_mm;
+	const struct balls *balls = &run->calibration->balls;
+	int count = 0;
+
+	for (int i = 0; i < ROUNDS; i++) {
+		count = touching_fit(&run->matches[view], image, pose, pixel_mm, balls, pairs);
+		if (i > 0 && count >= PAIRS_LEAST)
+			count = drop_outliers(run, pose, pairs, count);
+		if (count < PAIRS_LEAST)
+			return count;
+		pose_fit(pose, pixel_mm, balls, pairs, count);
+	}
+	return count;
+}
+
+/* Scratch of one thread. */
+struct scratch {
+	struct pair *pairs, *others; /* [BALLS_MOST] */
+	float *image;
+	int code; /* of the first picture that could not be had; then *err has been set */
+	struct error err;
+};
+
+static bool scratch_open(struct scratch *scratch, const struct geometry *nominal)
+{
+	*scratch = (struct scratch){.pairs = malloc(BALLS_MOST * sizeof(struct pair)),
+				    .others = malloc(BALLS_MOST * sizeof(struct pair)),
+				    .image = malloc((size_t)nominal->columns * (size_t)nominal->rows * sizeof(float))};
+	if (scratch->pairs != NULL && scratch->others != NULL && scratch->image != NULL)
+		return true;
+	scratch->code = error_set(&scratch->err, ERR_NO_MEMORY, "no memory for a view of %d x %d pixels",
+				  nominal->columns, nominal->rows);
+	return false;
+}
+
+static void scratch_close(struct scratch *scratch)
+{
+	free(scratch->pairs);
+	free(scratch->others);
+	free(scratch->image);
+}
+
+/*
+ * Where few shadows stand clear, those that touch are fitted, too, from the pose of the clear ones or, where that is
+ * none, from the first. Returns how many pairs are used.
+ */
+static int use_touching(const struct run *run, int view, const struct pose *first, struct scratch *scratch,
+			struct pose *pose, int clear)
+{
+	const struct calibrate_request *request = run->request;
+	struct pose tried = clear >= PAIRS_LEAST ? *pose : *first;
+	int used;
+
+	scratch->code = request->image(request->context, view, scratch->image, &scratch->err);
+	if (scratch->code < 0)
+		return clear;
+	used = refine_touching(run, view, scratch->image, &tried, scratch->others);
+	if (used < PAIRS_LEAST || used < clear)
+		return clear;
+	*pose = tried;
+	memcpy(scratch->pairs, scratch->others, (size_t)used * sizeof(*scratch->pairs));
+	return used;
+}
+
+/* A first pose from a view's pairs; the pairs that do not agree with it are dropped. Negative, with the reason, for
+ * none. */
+static int first_pose(const struct run *run, int view, bool again, struct pair *pairs, int matched,
+		      struct pose *ret_pose, int *ret_agreeing)
+{
+	const double *pixel_mm = run->request->pixel_mm;
+	const struct balls *balls = &run->calibration->balls;
+	struct calibrated_view *result = &run->calibration->views[view];
+
+	if (matched < PAIRS_LEAST) {
+		refuse(result, "%d of its %d shadows are where %s and this phantom have balls, expected %d or more",
+		       matched, run->works[view].count, again ? "its neighbours" : "the nominal geometry", PAIRS_LEAST);
+		return -1;
+	}
+	if (resect(balls, pairs, matched, pixel_mm, (unsigned)view, ret_pose, ret_agreeing) < 0) {
+		refuse(result, "no pose of source and detector explains six of its %d shadows", matched);
+		return -1;
+	}
+	result->rms = pose_fit(ret_pose, pixel_mm, balls, pairs, *ret_agreeing);
+	return 0;
+}
+
+static void find_view(const struct run *run, int view, double turn, bool again, struct scratch *scratch)
+{
+	struct calibrated_view *result = &run->calibration->views[view];
+	struct work *work = &run->works[view];
+	struct pair *pairs = scratch->pairs;
+	struct pose pose, first;
+	int matched = pair_view(run, view, turn, again, pairs), agreeing = 0, used = 0, expected;
+
+	if (first_pose(run, view, again, pairs, matched, &first, &agreeing) == 0) {
+		pose = first;
+		used = refine(run, view, &pose, pairs, agreeing);
+	} else if (again) {
+		/* Where hardly a shadow stands clear, the pose between its neighbours' may have each within a radius.
+		 */
+		pose_of_view(&first, &result->view);
+		pose = first;
+	} else {
+		return;
+	}
+	if (used < CLEAR_LEAST * on_picture(run, &first))
+		used = use_touching(run, view, &first, scratch, &pose, used);
+	if (used == 0 && agreeing == 0)
+		return;
+	expected = on_picture(run, &pose);
+	if (used < PAIRS_LEAST || used < SHARE_LEAST * expected) {
+		refuse(
+		    result,
+		    "one pose explains %d of its %d shadows, of the %d balls that it should show, with a residual of "
+		    "%.2f pixels over %d shadows before",
+		    used, work->count, expected, result->rms, agreeing);
+		return;
+	}
+	work->pose = pose;
+	work->pair_count = used;
+	memcpy(work->pairs, pairs, (size_t)used * sizeof(*pairs));
+	measure_view(run, view);
+	result->used = true;
+	result->refused[0] = '\0';
+	if (result->rms > RMS_MOST)
+		refuse(result, "its residual is %.2f pixels, expected at most %g", result->rms, RMS_MOST);
+}
+
+/*
+ * Refuses views whose residual is far above the others': shadows taken for other balls' leave some tenths of a pixel
+ * where a true pose leaves hundredths.
+ */
+static int refuse_uneven(const struct run *run, struct error *err)
+{
+	const int count = run->calibration->count;
+	float *all = malloc((size_t)count * sizeof(*all));
+	double limit;
+	int used = 0;
+
+	if (all == NULL)
+		return error_set(err, ERR_NO_MEMORY, "no memory for %d views", count);
+	for (int k = 0; k < count; k++)
+		if (run->calibration->views[k].used)
+			all[used++] = (float)run->calibration->views[k].rms;
+	limit = used > 0 ? fmax(UNEVEN_LEAST, UNEVEN_FACTOR * select_kth(all, used, used / 2)) : 0;
+	for (int k = 0; k < count; k++) {
+		struct calibrated_view *view = &run->calibration->views[k];
+
+		if (view->used && view->rms > limit)
+			refuse(view, "its residual is %.2f pixels, expected at most %.2f by those of the other views",
+			       view->rms, limit);
+	}
+	free(all);
+	return 0;
+}
+
+/* Tries all views that are not used yet. */
+static int find_round(const struct run *run, double turn, bool again, struct error *err)
+{
+	int failed = 0;
+
+#pragma omp parallel
+	{
+		struct scratch scratch;
+		bool open = scratch_open(&scratch, run->request->nominal);
+
+#pragma omp for schedule(dynamic)
+		for (int k = 0; k < run->calibration->count; k++)
+			if (open && scratch.code == 0 && !run->calibration->views[k].used)
+				find_view(run, k, turn, again, &scratch);
+		if (scratch.code < 0) {
+#pragma omp critical(calibrate_failed)
+			{
+				if (failed == 0)
+					*err = scratch.err;
+				failed = scratch.code;
+			}
+		}
+		scratch_close(&scratch);
+	}
+	return failed;
+}
+
+/*
+ * The first round begins from the nominal geometry; views that it refused begin once more, from where their neighbours
+ * stand.
+ * The search for a pose only begins there: the view's own shadows alone say where it ends.
+ */
+int find_views(struct run *run, double turn, struct error *err)
+{
+	int code = find_round(run, turn, false, err);
+
+	if (code == 0)
+		code = refuse_uneven(run, err);
+	if (code == 0)
+		code = sweep_fill(run->calibration, run->request->nominal, err);
+	if (code == 0)
+		code = find_round(run, turn, true, err);
+	return code == 0 ? refuse_uneven(run, err) : code;
+}
