@@ -116,7 +116,23 @@ int process_reap(struct process *process, char *ret_how, size_t size)
 		snprintf(ret_how, size, "exit status %d", WEXITSTATUS(status));
 	close(process->pidfd);
 	process->pidfd = -1;
-	return WIFEXITED(status) ? WEXITSTATUS(status) : -1;
+	return WIFEXITED(status) ? WEXITSTATUS(status) : -WTERMSIG(status);
+}
+
+const char *process_meaning(int end)
+{
+	switch (-end) {
+	case SIGKILL:
+		return "something outside ended it, as the kernel does where memory runs out";
+	case SIGSEGV:
+	case SIGBUS:
+	case SIGILL:
+	case SIGFPE:
+	case SIGABRT:
+		return "the program or this machine has a fault";
+	default:
+		return end < 0 ? "something outside ended it" : "it gave up, and the daemon's log says why";
+	}
 }
 
 void process_kill(const struct process *process)

@@ -28,8 +28,11 @@ void program_path(const char *name, char *ret_path, size_t size);
 enum { PROCESS_DESCRIPTOR = 3 };
 int process_start(const char *program, char *const *arguments, int descriptor, struct process *ret_process,
 		  struct error *err);
-/* Waits for the end; says how it ended ("signal 9 (Killed)"); returns the exit status, -1 where a signal ended it. */
+/* Waits for the end; says how it ended ("signal 9 (Killed)"); returns the exit status, or the signal's number,
+ * negative. */
 int process_reap(struct process *process, char *ret_how, size_t size);
+/* What such an end means, in words for a user: of any other than 0. */
+const char *process_meaning(int end);
 void process_kill(const struct process *process);
 
 #endif

@@ -7,10 +7,11 @@
  * The directory of one of the daemon's calibrations:
  *
  *   request.json  {"scan": id, "arm", "phantom": {...}, "adjust_balls", "created", "acquired": seconds since
- *                 1970, "sweep": the document of the scan}: what to do, written by the daemon; and again, with
- *                 "made": true, once there is a result
+ *                 1970, "sweep": the document of the scan}: what to do, written by the daemon; again, with "runs", for
+ *                 each process that ended without a result; and again, with "made": true, once there is a result
  *   result.json   {"ended", "error": null} and the members of calibration_json; or
- *                 {"ended", "error": {"code": enum error_code, "detail", "pointer"}}: written by cbct-worker
+ *                 {"ended", "error": {"code": enum error_code, "detail", "pointer"}}: written by cbct-worker, or by the
+ *                 daemon where no process comes to an end
  *
  * Of a calibration that a job has refined (proto/refinement.h) the request has "job" in place of the phantom,
  * and the result "geometry" alone: the daemon writes both.
@@ -21,6 +22,7 @@
 #define CALIBRATION_REQUEST "request.json"
 #define CALIBRATION_RESULT "result.json"
 #define CALIBRATION_MADE "made"
+#define CALIBRATION_RUNS "runs"
 
 /* Whole or not at all, as file_write_durable. */
 int sealed_write(const char *path, const cJSON *document, struct error *err);

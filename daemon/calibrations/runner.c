@@ -1,6 +1,7 @@
 /*
- * The calibrator: a thread that has one process at a time make the calibrations that are due, oldest first. A process
- * that ends without a result is a calibration that failed; one that is stopped with the daemon is begun anew.
+ * The calibrator: a thread that has one process at a time make the calibrations that are due, oldest first. One that is
+ * stopped with the daemon is begun anew. So is one whose process ends without a result, as a job is whose worker dies:
+ * the request counts these ends, and the last one that is allowed is its result, which a restart finds there.
  */
 #include <errno.h>
 #include <poll.h>
@@ -13,6 +14,8 @@
 #include "daemon/files.h"
 #include "daemon/log.h"
 #include "proto/clock.h"
+
+enum { RUNS_MOST = 3 }; /* as of a job that cannot be brought to an end */
 
 void calibrator_wake(struct calibrations *calibrations)
 {
@@ -86,10 +89,72 @@ static int run_process(struct calibrations *calibrations, const char *id, const 
 			process_kill(&process);
 	}
 	status = process_reap(&process, how, sizeof(how));
-	return status == 0 ? 0 : error_set(err, ERR_INTERNAL, "the process that made the calibration ended: %s", how);
+	return status == 0 ? 0 : error_set(err, ERR_INTERNAL, "%s: %s", how, process_meaning(status));
 }
 
-/* The entry as its files have it; a process that left no result has failed. */
+/* The result of a calibration that was broken off as often as it may be. */
+static int write_failure(const struct calibrations *calibrations, const char *id, int runs, const struct error *why,
+			 struct error *err)
+{
+	cJSON *result = cJSON_CreateObject(), *error = cJSON_AddObjectToObject(result, "error");
+	char path[1024], detail[sizeof(why->text) + 80];
+	int code;
+
+	snprintf(detail, sizeof(detail), "its process ended %d times without a result, the last time by %s", runs,
+		 why->text);
+	cJSON_AddNumberToObject(error, "code", ERR_INTERNAL);
+	cJSON_AddStringToObject(error, "detail", detail);
+	cJSON_AddStringToObject(error, "pointer", "");
+	cJSON_AddNumberToObject(result, "ended", clock_realtime());
+	calibration_path(calibrations, id, CALIBRATION_RESULT, path);
+	code = sealed_write(path, result, err);
+	cJSON_Delete(result);
+	return code;
+}
+
+/*
+ * Counts a process that ended without a result; *ret_again: another one may try. Negative where that cannot be
+ * recorded.
+ */
+static int count_run(const struct calibrations *calibrations, const char *id, const struct error *why, bool *ret_again,
+		     struct error *err)
+{
+	cJSON *request = NULL;
+	const cJSON *counted;
+	char path[1024];
+	int runs, code;
+
+	calibration_path(calibrations, id, CALIBRATION_REQUEST, path);
+	code = sealed_read(path, &request, err);
+	if (code != 0)
+		return code;
+	counted = cJSON_GetObjectItemCaseSensitive(request, CALIBRATION_RUNS);
+	runs = (cJSON_IsNumber(counted) ? counted->valueint : 0) + 1;
+	cJSON_DeleteItemFromObjectCaseSensitive(request, CALIBRATION_RUNS);
+	cJSON_AddNumberToObject(request, CALIBRATION_RUNS, runs);
+	*ret_again = runs < RUNS_MOST;
+	code = *ret_again ? sealed_write(path, request, err) : write_failure(calibrations, id, runs, why, err);
+	cJSON_Delete(request);
+	log_line(LEVEL_WARNING, "calibration %s: its process ended without a result, run %d of %d: %s", id, runs,
+		 RUNS_MOST, why->text);
+	if (code != 0)
+		store_distrust(calibrations->store, err);
+	return code;
+}
+
+/* It is due again. */
+static void requeue(struct calibrations *calibrations, const char *id)
+{
+	struct entry *entry;
+
+	pthread_mutex_lock(&calibrations->lock);
+	entry = calibration_entry(calibrations, id);
+	if (entry != NULL)
+		entry->state = CALIBRATION_QUEUED;
+	pthread_mutex_unlock(&calibrations->lock);
+}
+
+/* The entry as its files have it once its process has ended. */
 static void settle(struct calibrations *calibrations, const char *id, int code, const struct error *why)
 {
 	cJSON *request = NULL, *result = NULL;
@@ -103,11 +168,22 @@ static void settle(struct calibrations *calibrations, const char *id, int code, 
 	if (code == 0 && loaded.state == CALIBRATION_QUEUED) {
 		cJSON_Delete(loaded.brief);
 		loaded.brief = NULL;
-		code = error_set(&failure, ERR_INTERNAL, "the process that made the calibration left no result");
+		code = error_set(&failure, ERR_INTERNAL, "exit status 0: it said that it was done");
 	}
+	if (code == ERR_INTERNAL) {
+		bool again = false;
+
+		code = count_run(calibrations, id, why->code != 0 ? why : &failure, &again, &failure);
+		if (code == 0 && again) {
+			requeue(calibrations, id);
+			return;
+		}
+		if (code == 0)
+			code = calibration_load(calibrations, id, &loaded, &failure);
+	}
+	shown = failure; /* clients do not see paths, the log does */
 	if (code != 0 && calibration_read(calibrations, id, false, &request, &result, &failure) == 0) {
 		loaded.state = CALIBRATION_FAILED;
-		shown = failure; /* clients do not see paths, the log does */
 		path_hide(shown.text, store_directory(calibrations->store));
 		loaded.brief = calibration_brief(id, request, NULL, &shown);
 	}
@@ -115,7 +191,7 @@ static void settle(struct calibrations *calibrations, const char *id, int code, 
 	cJSON_Delete(result);
 	log_line(code == 0 ? LEVEL_INFO : LEVEL_ERROR, "calibration %s has %s%s%s", id,
 		 calibration_state_names[loaded.brief != NULL ? loaded.state : CALIBRATION_FAILED],
-		 code != 0 ? ": " : "", code != 0 ? failure.text : "");
+		 code != 0 ? ": " : "", code != 0 ? shown.text : "");
 	pthread_mutex_lock(&calibrations->lock);
 	entry = calibration_entry(calibrations, id);
 	if (entry != NULL) {

@@ -367,6 +367,50 @@ test_a_failure_shows_no_path_of_the_server() {
 	done
 }
 
+# A process that ends without a result is tried three times, as a job's is; then it has failed, for good, by a reason in words.
+test_a_process_that_crashes_is_tried_three_times() {
+	local how words id
+	cat >"$work/faulty" <<-END
+		#!/bin/sh
+		if [ "\$1" = --calibrate ]; then
+			echo >>"$work/runs"
+			[ \$(wc -l <"$work/runs") = "\$(cat "$work/good_run")" ] || eval "\$(cat "$work/how")"
+		fi
+		exec "$BUILD/cbct-worker" "\$@"
+	END
+	chmod +x "$work/faulty"
+	echo never >"$work/good_run"
+	start_daemon --worker "$work/faulty"
+	balls
+	for how in 'kill -SEGV $$' 'kill -KILL $$' 'exit 7' 'exit 0'; do
+		echo "$how" >"$work/how"
+		rm -f "$work/runs"
+		case $how in
+		*SEGV*) words='its process ended 3 times without a result, the last time by signal 11 (Segmentation fault): the program or this machine has a fault' ;;
+		*KILL*) words='signal 9 (Killed): something outside ended it, as the kernel does where memory runs out' ;;
+		*7) words='exit status 7: it gave up' ;;
+		*0) words='exit status 0' ;;
+		esac
+		calibrated
+		expect_json ".state == \"failed\" and .ended != null and .error.type == \"urn:cbctd:problem:internal\" and (.error.detail | contains(\"$words\"))"
+		[ "$(wc -l <"$work/runs")" = 3 ] || fail "$how: three runs, got $(wc -l <"$work/runs")"
+		id=$calibration
+		stop_daemon
+		start_daemon --worker "$work/faulty"
+		req GET "/v1/calibrations/$id?wait=5"
+		expect_json ".state == \"failed\" and (.error.detail | contains(\"$words\"))"
+		[ "$(wc -l <"$work/runs")" = 3 ] || fail "$how: begun anew after a restart"
+	done
+	# one crash is no failure, and a restart between two does not forget it
+	echo 'kill -SEGV $$' >"$work/how"
+	echo 3 >"$work/good_run"
+	rm -f "$work/runs"
+	calibrated
+	expect_json '.state == "succeeded" and .used == 24'
+	[ "$(wc -l <"$work/runs")" = 3 ] || fail "the third run is the good one"
+	stop_daemon
+}
+
 test_cbct_and_python_calibrate() {
 	start_daemon
 	balls
