@@ -324,8 +324,58 @@ static void take_mean_off(struct path *path, const struct path_view *views, int 
 			path->numbers[k][i] -= mean[i];
 }
 
+/* The mean over the views in use of the way across a view's columns and rows, along its beam. */
+static void mean_beam(const struct path_view *views, int count, double ret_mean[3])
+{
+	double axes[3][3];
+	int used = 0;
+
+	memset(ret_mean, 0, 3 * sizeof(*ret_mean));
+	for (int v = 0; v < count; v++)
+		used += views[v].used;
+	for (int v = 0; v < count; v++) {
+		view_axes(&views[v].view, axes);
+		for (int a = 0; a < 3 && views[v].used; a++)
+			ret_mean[a] += axes[2][a] / used;
+	}
+}
+
+/*
+ * Adds that an object is expected to be no nearer to the source in all views, `nearer` mm: that would be a larger
+ * object, in the same images. A shift of it that the views share is none along their beams' mean.
+ */
+static void expect_size(const struct path *path, const struct path_view *views, int count, double nearer,
+			struct equations *equations)
+{
+	double mean[3], along[PATH_NUMBERS * PATH_KNOTS_MOST] = {0}, now = 0, weight;
+	int used = 0;
+
+	mean_beam(views, count, mean);
+	for (int v = 0; v < count; v++) {
+		const double u = on_knots(path, views[v].at);
+		double axes[3][3];
+
+		if (!views[v].used)
+			continue;
+		used++;
+		view_axes(&views[v].view, axes);
+		for (int k = 0; k < path->knots; k++)
+			for (int a = 0; a < 3; a++)
+				along[PATH_NUMBERS * k + a] += spline(u - k) * (axes[2][a] - mean[a]);
+	}
+	weight = 1 / (nearer * nearer * (used > 0 ? used : 1));
+	for (int k = 0; k < path->knots; k++)
+		for (int a = 0; a < 3; a++)
+			now += along[PATH_NUMBERS * k + a] * path->numbers[k][a];
+	for (int i = 0; i < PATH_NUMBERS * path->knots; i++) {
+		equations->right[i] -= weight * now * along[i];
+		for (int j = 0; j < PATH_NUMBERS * path->knots; j++)
+			equations->matrix[i * equations->size + j] += weight * along[i] * along[j];
+	}
+}
+
 int path_step(struct path *path, const struct path_view *views, int count, const double sigma[PATH_NUMBERS],
-	      double factor, struct error *err)
+	      double nearer, double factor, struct error *err)
 {
 	struct equations equations = {.size = PATH_NUMBERS * (path->knots + path->of_views)};
 	const size_t size = (size_t)equations.size;
@@ -337,6 +387,7 @@ int path_step(struct path *path, const struct path_view *views, int count, const
 	for (int v = 0; v < count; v++)
 		if (views[v].used)
 			add_view(path, &views[v], sigma, &equations);
+	expect_size(path, views, count, nearer, &equations);
 	for (int i = 0; i < PATH_NUMBERS && path->of_views; i++) {
 		const int row = PATH_NUMBERS * path->knots + i;
 

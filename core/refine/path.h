@@ -59,9 +59,11 @@ struct path_view {
 };
 /*
  * A step of Gauss and Newton, `factor` times its length; the numbers along and about a view's axes are expected to be
- * within sigma[] of 0. Returns 0, or ERR_NO_MEMORY.
+ * within sigma[] of 0, and their way along the beam in the mean over the views within `nearer` mm, for no scan tells an
+ * object that is nearer to the source in all views from a larger one (INFINITY: nothing is expected). Returns 0, or
+ * ERR_NO_MEMORY.
  */
 int path_step(struct path *path, const struct path_view *views, int count, const double sigma[PATH_NUMBERS],
-	      double factor, struct error *err);
+	      double nearer, double factor, struct error *err);
 
 #endif

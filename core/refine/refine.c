@@ -182,7 +182,7 @@ int refine_work(const struct reduced *reduced, enum refine_kind kind, bool is_re
 /* ---- what has been reached ---- */
 
 /* A change of what the bytes mean, or of the steps, is another version. */
-#define STATE_NAME "cbctd refining 2"
+#define STATE_NAME "cbctd refining 3"
 struct state_head {
 	char name[24];
 	struct refinement refinement;

@@ -36,7 +36,8 @@
  * Without a reference what all views share is no motion: a refined geometry has the object, on the whole, where the
  * told one has it (core/refine/rest.h), aside of the truth by what the departures of all views share; and an object
  * that moved lies in the mean place of its path over the views. Nor does a scan tell how large the object is: the way
- * along the beam is expected to be small. Bins limit what can be found, to about a thirtieth of one.
+ * along the beam is expected to be small, of an object that moves in the mean over the views. Bins limit what can be
+ * found, to about a thirtieth of one.
  */
 enum { REFINE_VIEWS_MOST = 120, REFINE_BINS_MOST = 160 };
 

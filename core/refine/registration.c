@@ -27,6 +27,9 @@ static const double EXPECTED[REFINE_KINDS][PATH_NUMBERS] = {
     [REFINE_MOTION] = {2, 2, 1, 4, 4, 5},
 };
 
+/* How much nearer to the source an object that moves may be, in the mean over the views: mm. A reference tells. */
+static const double NEARER = 0.05;
+
 /* A reference tells a tilt from a turn of the object, so that both may be larger. */
 static const double EXPECTED_REFERRED[REFINE_KINDS][PATH_NUMBERS] = {
     [REFINE_GEOMETRY] = {2, 2, .5, 1, 1, 2},
@@ -425,6 +428,7 @@ int registration_step(struct registration *fit, struct path *path, double alike,
 	}
 	return path_step(path, fit->views, fit->geometry.count,
 			 fit->referred ? EXPECTED_REFERRED[fit->kind] : EXPECTED[fit->kind],
+			 fit->referred || fit->kind != REFINE_MOTION ? INFINITY : NEARER,
 			 fit->referred ? FACTOR_REFERRED : FACTOR, err);
 }
 

@@ -110,7 +110,7 @@ START_TEST(a_step_finds_what_made_the_residuals)
 					views[v].products[at++] += value[i] * value[j];
 		}
 	}
-	ck_assert_int_eq(path_step(&path, views, VIEWS, far, 1, &err), 0);
+	ck_assert_int_eq(path_step(&path, views, VIEWS, far, INFINITY, 1, &err), 0);
 	for (int v = 0; v < VIEWS; v += 5) {
 		double found[PATH_NUMBERS], expected[PATH_NUMBERS], other[PATH_NUMBERS], start[PATH_NUMBERS];
 
@@ -146,10 +146,52 @@ START_TEST(what_all_views_share_is_no_path)
 			for (int j = 0; j <= i; j++, at++)
 				views[v].products[at] = i == j ? 1e4 : j == 0 ? 1e4 * aside[i - 1] : 0;
 	}
-	ck_assert_int_eq(path_step(&path, views, VIEWS, small, 1, &err), 0);
+	ck_assert_int_eq(path_step(&path, views, VIEWS, small, INFINITY, 1, &err), 0);
 	for (int i = 0; i < PATH_NUMBERS; i++)
 		ck_assert_double_eq_tol(path.common[i], aside[i], .01);
 	ck_assert_double_lt(path_size(&path), .02);
+	free(views);
+}
+END_TEST
+
+/*
+ * An object that is nearer to all views is a larger one in its place: a path does not follow that, unless the size is
+ * known, and follows what else there is.
+ */
+START_TEST(what_is_nearer_to_all_views_is_no_path)
+{
+	static const double far[PATH_NUMBERS] = {1e3, 1e3, 1e3, 1e3, 1e3, 1e3};
+	const bool sized = _i == 0;
+	const struct arm arm = {.columns = COLUMNS, .rows = ROWS, .count = VIEWS, .pixel = PIXEL, .step = .06};
+	struct path_view *views = calloc(VIEWS, sizeof(*views));
+	double axes[3][3], first[PATH_NUMBERS], last[PATH_NUMBERS], nearer = 0;
+	struct path path;
+	struct error err;
+
+	path_open(&path, false, .06 * (VIEWS - 1), 12);
+	for (int v = 0; v < VIEWS; v++) {
+		views[v] = (struct path_view){.used = true, .at = .06 * v, .view = arm_nominal(&arm, v)};
+		view_axes(&views[v].view, axes);
+		for (int i = 0, at = 0; i <= PATH_NUMBERS; i++)
+			for (int j = 0; j <= i; j++, at++)
+				views[v].products[at] = i == j ? 1 : i < 4 && j == 0 ? 2 * axes[2][i - 1] : 0;
+		views[v].products[6] = 3. * v / (VIEWS - 1); /* along z */
+	}
+	ck_assert_int_eq(path_step(&path, views, VIEWS, far, sized ? INFINITY : .05, 1, &err), 0);
+	for (int v = 0; v < VIEWS; v++) {
+		double numbers[PATH_NUMBERS];
+
+		path_at(&path, views[v].at, numbers);
+		view_axes(&views[v].view, axes);
+		nearer += vec_dot(axes[2], numbers) / VIEWS;
+	}
+	path_at(&path, 0, first);
+	path_at(&path, path.length, last);
+	ck_assert_double_eq_tol(last[2] - first[2], 3, 1e-3);
+	if (sized)
+		ck_assert_double_gt(nearer, 1);
+	else
+		ck_assert_double_lt(fabs(nearer), .1);
 	free(views);
 }
 END_TEST
@@ -974,6 +1016,7 @@ Suite *refine_suite(void)
 	tcase_add_test(paths, more_knots_do_not_change_a_path);
 	tcase_add_loop_test(paths, a_step_finds_what_made_the_residuals, 0, 2);
 	tcase_add_test(paths, what_all_views_share_is_no_path);
+	tcase_add_loop_test(paths, what_is_nearer_to_all_views_is_no_path, 0, 2);
 	tcase_add_test(paths, a_geometry_shows_the_object_where_it_was_told);
 	tcase_add_test(paths, halved_bins_are_those_of_larger_ones);
 	tcase_add_test(paths, a_displaced_detector_needs_a_reference);
