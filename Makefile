@@ -94,7 +94,7 @@ daemon_sources := $(filter-out daemon/worker.c $(dicom_sources) $(without),$(wil
 # What the unit tests know of the daemon: its state, without HTTP.
 state_sources  := $(filter-out $(without),$(wildcard daemon/store/*.c daemon/jobs/*.c)) $(patsubst %,daemon/%.c,api/document files histogram id lock log problem process watch)
 cbct_sources   := $(wildcard clients/cbct/*.c)
-unit_sources   := $(wildcard tests/unit/*.c)
+unit_sources   := $(wildcard tests/unit/*.c) tests/bench/departed.c tests/bench/fdk_volume.c tests/bench/bodies.c
 
 # say NAME: a short line for a recipe, its commands with V=1
 say = $(if $(filter 1,$(V)),,@echo '  $(1)' '$(patsubst $(BUILD)/%,%,$@)';)
@@ -254,7 +254,7 @@ $(BUILD)/breathing: $(call objects,tests/bench/breathing.c tests/bench/bodies.c 
 	$(call say,LINK)$(CC) $(LDFLAGS) -o $@ $^ $(call pkg,--libs,$(core_libs)) $(LIBM)
 
 # What the refinement makes of such scans.
-$(BUILD)/refine: $(call objects,tests/bench/refine.c tests/bench/fdk_volume.c tests/bench/bodies.c tests/unit/arm.c) $(core_objects) $(cuda_objects)
+$(BUILD)/refine: $(call objects,tests/bench/refine.c tests/bench/departed.c tests/bench/fdk_volume.c tests/bench/bodies.c tests/unit/arm.c) $(core_objects) $(cuda_objects)
 	$(call say,LINK)$(CC) $(LDFLAGS) -o $@ $^ $(call pkg,--libs,$(core_libs)) $(if $(cuda_objects),$(cuda_libs)) $(LIBM)
 
 $(BUILD)/calibrate-bench: $(call objects,tests/bench/calibrate.c tests/bench/fdk_volume.c tests/unit/arm.c) $(library)

@@ -127,17 +127,58 @@ static void make_even(struct body *body)
 		add(body, SHAPE_ELLIPSOID, 8, 8, 8, 45 * cos(i), 45 * sin(i), 8 * (i - 3), 0, 50 + 30 * i);
 }
 
+/* A bone along z: its shell's density over the flesh's, and marrow within. */
+static void add_shaft(struct body *body, double radius, double half, const double at[3])
+{
+	add(body, SHAPE_CYLINDER, radius, .9 * radius, half, at[0], at[1], at[2], 0, 900);
+	add(body, SHAPE_CYLINDER, .6 * radius, .5 * radius, half, at[0], at[1], at[2], 0, -750);
+	for (int end = -1; end <= 1; end += 2)
+		add(body, SHAPE_ELLIPSOID, 1.3 * radius, 1.2 * radius, radius, at[0], at[1], at[2] + end * half, 0,
+		    300);
+}
+
+/* A short bone, or one that lies across z. */
+static void add_nodule(struct body *body, const double semi_axes[3], const double at[3], double angle)
+{
+	add(body, SHAPE_ELLIPSOID, semi_axes[0], semi_axes[1], semi_axes[2], at[0], at[1], at[2], angle, 700);
+	add(body, SHAPE_ELLIPSOID, semi_axes[0] - 1.5, semi_axes[1] - 1.5, semi_axes[2] - 1.5, at[0], at[1], at[2],
+	    angle, -450);
+}
+
+/* Along z, the fingers up and a little bent, beside the axis; the arm goes on beyond the rows. */
 static void make_hand(struct body *body)
 {
-	add(body, SHAPE_ELLIPSOID, 40, 16, 90, 0, 0, 0, 0, 1000);
-	for (int i = 0; i < 5; i++)
-		for (int j = 0; j < 4; j++) {
-			const double x = -28 + 14 * i, z = -55 + 34 * j + 3 * i;
+	static const double x0 = 16, y0 = -22, lengths[3] = {20, 12, 8.5}, bent[3] = {0, 3, 8};
 
-			add(body, SHAPE_ELLIPSOID, 5, 4.5, 14, x, 0, z, 0, 700);
-			add(body, SHAPE_ELLIPSOID, 3.4, 3, 12, x, 0, z, 0, -450);
+	add(body, SHAPE_CYLINDER, 27, 18, 60, x0, y0, -124, 0, 1000);
+	add(body, SHAPE_CYLINDER, 41, 14, 40, x0, y0, -24, 0, 1000);
+	add_shaft(body, 11, 50, (double[]){x0 - 10, y0, -122});
+	add_shaft(body, 7, 50, (double[]){x0 + 13, y0 + 3, -122});
+	for (int i = 0; i < 8; i++)
+		add_nodule(body, (double[]){6.5 + i % 3 * .5, 6, 5.5 + i % 2},
+			   (double[]){x0 - 20 + 13.5 * (i % 4), y0 + 2 * (i % 3) - 2, -60 + i / 4 * 13}, .3 * i);
+	for (int i = 0; i < 4; i++) {
+		double z = 16;
+
+		add_shaft(body, 4.3 - .2 * i, 24, (double[]){x0 - 29 + 19 * i, y0 + (i - 1.5) * (i - 1.5), -13});
+		for (int j = 0; j < 3; j++) {
+			const double half = lengths[j] * (i == 3 ? .8 : i == 1 ? 1.1 : 1);
+			const double x = x0 + (-29 + 19 * i) * (1 + .06 * j), y = y0 + bent[j];
+
+			add(body, SHAPE_CYLINDER, 8.8 - .9 * j, 8 - .7 * j, half, x, y, z + half, 0, 1000);
+			add_shaft(body, 4.2 - .7 * j, half - 2.5, (double[]){x, y, z + half});
+			z += 2 * half;
 		}
-	scatter(body, 20, (double[]){30, 8, 60}, (double[]){1, 2.5}, (double[]){80, 300});
+	}
+	/* The thumb, across. */
+	add(body, SHAPE_ELLIPSOID, 42, 12, 13, x0 - 72, y0 + 34, -36, -.7, 1000);
+	add_nodule(body, (double[]){18, 5.5, 5.5}, (double[]){x0 - 55, y0 + 20, -38}, -.7);
+	add_nodule(body, (double[]){14, 4.5, 4.5}, (double[]){x0 - 80, y0 + 41, -36}, -.7);
+	add_nodule(body, (double[]){10, 4, 4}, (double[]){x0 - 98, y0 + 56, -35}, -.7);
+	for (int i = 0; i < 24; i++)
+		add(body, SHAPE_ELLIPSOID, 1 + 1.5 * uniform(), 1 + 1.5 * uniform(), 2 + 6 * uniform(),
+		    x0 + 70 * (uniform() - .5), y0 + 18 * (uniform() - .5), -24 + 70 * (uniform() - .5), 0,
+		    40 + 160 * uniform());
 }
 
 const char *const kind_names[KINDS] = {"head", "abdomen, truncated", "knee, screws", "head and neck", "even", "hand"};

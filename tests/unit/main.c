@@ -15,12 +15,12 @@
 	row(error) row(geometry) row(orbit) row(filter) row(phantom) row(raw) row(detector) row(content)               \
 	    row(misplaced) row(impulses) row(recon) row(algorithm) row(stopping) row(weights) row(quality)             \
 		row(support) row(noise) row(averaging) row(binning) row(alternation) row(exterior) row(metal)          \
-		    row(dense) row(stuck) row(shadow) row(agreement) row(breathing) row(refine) row(outofcore)         \
-			row(cards) row(study) row(backend) row(json) row(scan) row(recipe) row(parameter) row(format)  \
-			    row(patient) row(subject) row(metaimage) row(rtk_geometry) row(slice) row(sums)            \
-				row(scan_directory) row(message) row(queue) row(outcome) row(watchdog)                 \
-				    row(host_memory) row(route) row(lock) row(log) row(store) row(catalogue)           \
-					row(upgrade) row(ledger) row(job) row(calibrate)
+		    row(dense) row(stuck) row(shadow) row(agreement) row(breathing) row(refine) row(motion)            \
+			row(outofcore) row(cards) row(study) row(backend) row(json) row(scan) row(recipe)              \
+			    row(parameter) row(format) row(patient) row(subject) row(metaimage) row(rtk_geometry)      \
+				row(slice) row(sums) row(scan_directory) row(message) row(queue) row(outcome)          \
+				    row(watchdog) row(host_memory) row(route) row(lock) row(log) row(store)            \
+					row(catalogue) row(upgrade) row(ledger) row(job) row(calibrate)
 
 /* Weak: a row may stand here before its file does. What is missing is said aloud. */
 #define DECLARE(name) Suite *name##_suite(void) __attribute__((weak));
