@@ -260,8 +260,9 @@ $(BUILD)/refine: $(call objects,tests/bench/refine.c tests/bench/departed.c test
 $(BUILD)/calibrate-bench: $(call objects,tests/bench/calibrate.c tests/bench/fdk_volume.c tests/unit/arm.c) $(library)
 	$(call say,LINK)$(CC) $(LDFLAGS) -o $@ $^ $(call pkg,--libs,$(core_libs)) $(LIBM)
 
+# What is said of right phantoms, and of drawings that are wrong.
 $(BUILD)/phantoms: $(call objects,tests/bench/phantoms.c tests/unit/arm.c) $(library)
-	$(call say,LINK)$(CC) $(LDFLAGS) -o $@ $^ $(call pkg,--libs,$(core_libs)) $(LIBM)
+	$(call say,LINK)$(CC) $(LDFLAGS) -o $@ $^ $(call pkg,--libs,$(files_libs) $(proto_libs) $(core_libs)) $(LIBM)
 
 # Claims of many workers at once in the ledger of a fleet.
 $(BUILD)/claims: $(call objects,tests/bench/claims.c $(state_sources)) $(library)
@@ -347,6 +348,10 @@ fuzz: setup ## each fuzz target for FUZZ_SECONDS=10 (needs clang)
 	@$(MAKE) --no-print-directory -j$$(nproc) fuzzers BUILD=$(BUILD)/fuzz CC=clang \
 		SANITIZE=fuzzer-no-link,address,undefined OPENMP= CUDA=0
 	@BUILD=$(BUILD)/fuzz FUZZ_SECONDS=$(FUZZ_SECONDS) tests/fuzz/run.sh
+
+bench-phantoms: setup ## calibrations of random phantoms with right and wrong drawings, on standard output
+	@$(MAKE) --no-print-directory -j$$(nproc) $(BUILD)/phantoms >&2
+	@$(BUILD)/phantoms
 
 bench-denoise: setup ## the default TV on anatomies beside the best of a sweep, a table on standard output
 	@$(MAKE) --no-print-directory -j$$(nproc) $(BUILD)/denoise >&2
@@ -534,6 +539,6 @@ clean: ## removes build/
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z_.-]+:.*## /{printf "  make %-21s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
 
-.PHONY: all test-programs for-tests again setup demo check soak fuzz fuzzers paper paper-report bench bench-agreement bench-breathing bench-refine bench-calibrate bench-denoise bench-presets bench-stopping bench-methods check-gpu bench-gpu asan tsan lint format rooms pictures third-party compile_commands.json install deb container sbom reproducible clean help
+.PHONY: all test-programs for-tests again setup demo check soak fuzz fuzzers paper paper-report bench bench-agreement bench-breathing bench-refine bench-calibrate bench-phantoms bench-denoise bench-presets bench-stopping bench-methods check-gpu bench-gpu asan tsan lint format rooms pictures third-party compile_commands.json install deb container sbom reproducible clean help
 .SECONDARY:
 -include $(shell find $(BUILD) -path $(BUILD)/test -prune -o -type f -name '*.d' -print 2>/dev/null)

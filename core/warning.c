@@ -61,6 +61,8 @@ const struct warning_kind warning_kinds[] = {
     {"calibration_other_sweep", SEVERITY_CAUTION, "The arm was calibrated on another sweep: the image may be blurred."},
     {"calibration_scale", SEVERITY_CAUTION,
      "The phantom may have another size than its drawing: sizes in images may be wrong."},
+    {"calibration_shape", SEVERITY_CAUTION,
+     "The phantom may be another than its drawing: the arm's places, and sizes in images, may be wrong."},
     {"calibration_turn", SEVERITY_CAUTION,
      "The phantom looks the same when it is turned: the arm's angles may be off by that turn."},
     {"calibration_turned", SEVERITY_SERIOUS,

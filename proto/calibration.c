@@ -14,6 +14,9 @@ static const double degree = M_PI / 180;
 static const double length_least = 1e-3, length_most = 1000; /* mm, of phantoms */
 static const double angle_most = 360;                        /* degrees */
 
+/* By how much an arm's distances may differ from the nominal ones without a word; before diameters had an error. */
+static const double distance_open = .01, distance_open_before = .03;
+
 /* ---- phantoms ---- */
 
 static int read_places(struct json_reader *reader, struct balls *ret_balls)
@@ -349,7 +352,9 @@ cJSON *calibration_json(const struct calibration *calibration)
 	else
 		cJSON_AddNullToObject(json, "other_turn_deg");
 	cJSON_AddNumberToObject(json, "diameter_ratio", calibration->diameter_ratio);
+	cJSON_AddNumberToObject(json, "diameter_error", calibration->diameter_error);
 	cJSON_AddNumberToObject(json, "distance_ratio", calibration->distance_ratio);
+	cJSON_AddNumberToObject(json, "explained_mm", calibration->explained);
 	cJSON_AddNumberToObject(json, "balls_moved_mm", calibration->adjusted_rms);
 	list = cJSON_AddArrayToObject(json, "balls_mm");
 	for (int b = 0; b < calibration->balls.count; b++) {
@@ -366,4 +371,59 @@ cJSON *calibration_json(const struct calibration *calibration)
 	json_add(json, "geometry", matrices_json(views, calibration->count));
 	free(views);
 	return json;
+}
+
+static double number_of(const cJSON *object, const char *name, double otherwise)
+{
+	const cJSON *number = cJSON_GetObjectItemCaseSensitive(object, name);
+
+	return cJSON_IsNumber(number) ? number->valuedouble : otherwise;
+}
+
+static void add_doubt(cJSON *doubts, const char *code, const char *detail)
+{
+	cJSON *doubt = cJSON_CreateObject();
+
+	cJSON_AddStringToObject(doubt, "code", code);
+	cJSON_AddStringToObject(doubt, "detail", detail);
+	json_append(doubts, doubt);
+}
+
+/*
+ * The poses of a drawing of another scale are those of the same arm in that scale, with the same residual: only the
+ * balls' diameters and the nominal distances know of it. A drawing of another shape leaves a residual.
+ */
+cJSON *calibration_doubts(const cJSON *json)
+{
+	const double machined = .1; /* mm, by which balls may lie off their drawing */
+	const double shadows = number_of(json, "diameter_ratio", 1), sources = number_of(json, "distance_ratio", 1);
+	const double shadows_open = number_of(json, "diameter_error", distance_open_before),
+		     sources_open = cJSON_HasObjectItem(json, "diameter_error") ? distance_open : distance_open_before;
+	const double residual = number_of(json, "residual_isocentre_mm", 0),
+		     moved = number_of(json, "balls_moved_mm", 0);
+	const double limit = hypot(machined, number_of(json, "explained_mm", INFINITY));
+	cJSON *doubts = cJSON_CreateArray();
+	char detail[400];
+
+	if (fabs(shadows - 1) > shadows_open || fabs(sources - 1) > sources_open) {
+		snprintf(detail, sizeof(detail),
+			 "the shadows are %.3f times as wide as those of the drawing's balls (expected within %.1f "
+			 "%%), and the "
+			 "sources stand %.3f times as far from the isocentre as the scan's geometry has them (within "
+			 "%.1f %%): "
+			 "the drawing may have another scale than the phantom",
+			 shadows, 100 * shadows_open, sources, 100 * sources_open);
+		add_doubt(doubts, "calibration_scale", detail);
+	}
+	if (residual > limit || moved > 2 * machined) {
+		snprintf(
+		    detail, sizeof(detail),
+		    "the shadows lie %.2f mm from where the drawing has them, at the isocentre, and balls that were "
+		    "adjusted "
+		    "%.2f mm; noise and balls %.1f mm off their drawing explain %.2f mm: the drawing may be that of "
+		    "another phantom",
+		    residual, moved, machined, limit);
+		add_doubt(doubts, "calibration_shape", detail);
+	}
+	return doubts;
 }

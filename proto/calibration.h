@@ -33,6 +33,11 @@ int calibration_from_directory(const struct scan_files *files, const struct ball
  * in a scan's document. NULL for no memory; the caller's to delete.
  */
 cJSON *calibration_json(const struct calibration *calibration);
+/*
+ * What is doubtful of a calibration, by the numbers of its document: a list of {"code", "detail"} of warnings
+ * (core/warning.h), the caller's to delete.
+ */
+cJSON *calibration_doubts(const cJSON *json);
 /* The `geometry` of a scan document, kind "matrices". */
 cJSON *matrices_json(const struct view *views, int count);
 

@@ -45,10 +45,8 @@ static int phantom_read(const char *path, struct balls *ret_balls, struct error 
 	return code;
 }
 
-static int result_write(const struct calibrate_options *options, const struct calibration *calibration,
-			struct error *err)
+static int result_write(const struct calibrate_options *options, const cJSON *document, struct error *err)
 {
-	cJSON *document = calibration_json(calibration);
 	char *text = json_print(document, NULL);
 	FILE *file;
 	int code = text != NULL ? output_open(options->output, &file, err)
@@ -59,29 +57,18 @@ static int result_write(const struct calibrate_options *options, const struct ca
 		code = output_close(file, options->output, err);
 	}
 	free(text);
-	cJSON_Delete(document);
 	return code;
 }
 
-/* Shadows or distances of another size than the drawing and the nominal geometry have together. */
-static void scale_say(const struct calibration *calibration)
-{
-	const double doubtful = 0.03;
-
-	if (fabs(calibration->diameter_ratio - 1) <= doubtful && fabs(calibration->distance_ratio - 1) <= doubtful)
-		return;
-	fprintf(
-	    stderr,
-	    "caution: the shadows are %.3f times as wide as those of the drawing's balls, and the sources stand %.3f "
-	    "times as far from the isocentre as the scan's geometry has them: the drawing may have another scale than "
-	    "the phantom\n",
-	    calibration->diameter_ratio, calibration->distance_ratio);
-}
-
 /* Prints the figures that a person looks for first. */
-static void result_say(const struct calibration *calibration)
+static void result_say(const struct calibration *calibration, const cJSON *document)
 {
-	scale_say(calibration);
+	cJSON *doubts = calibration_doubts(document);
+	const cJSON *doubt;
+
+	cJSON_ArrayForEach(doubt, doubts)
+	    fprintf(stderr, "caution: %s\n", cJSON_GetObjectItemCaseSensitive(doubt, "detail")->valuestring);
+	cJSON_Delete(doubts);
 	fprintf(stderr, "%d of %d views, residual %.3f pixels, %.4f mm at the isocentre\n", calibration->used,
 		calibration->count, calibration->rms, calibration->rms_isocentre);
 	if (calibration->rival_turn != 0)
@@ -212,8 +199,15 @@ static int calibrate_run(const void *values, struct error *err)
 	}
 	code = calibration_from_directory(&files, &balls, options->adjust_balls, &calibration, err);
 	if (code == 0) {
-		result_say(&calibration);
-		code = result_write(options, &calibration, err);
+		cJSON *document = calibration_json(&calibration);
+
+		if (document == NULL)
+			code = error_set(err, ERR_NO_MEMORY, "no memory for a calibration's document");
+		else
+			result_say(&calibration, document);
+		if (code == 0)
+			code = result_write(options, document, err);
+		cJSON_Delete(document);
 		if (code == 0 && options->apply != NULL)
 			code = apply(options, &calibration, files.scan, err);
 		calibration_clear(&calibration);

@@ -12,6 +12,7 @@ static const double DIAMETER_TOLERANCE = .15;
 static const double SCALE_TOLERANCE = .1; /* of the mean distance of the sources, against the nominal one */
 static const double COUNTS_LEAST = 30;    /* a line integral that no picture has as its median */
 static const double USED_LEAST = .75;     /* of the views */
+static const double CENTRING = .05;       /* pixels, by which a shadow's centre may be wrong without noise */
 static const double DRAWING_SIGMA = .1;   /* mm, of machining, where balls are adjusted */
 
 /* ---- pictures ---- */
@@ -166,6 +167,8 @@ static int summarise(struct run *run, struct error *err)
 	struct calibration *calibration = run->calibration;
 	const struct geometry *nominal = run->request->nominal;
 	double squares = 0, squares_isocentre = 0, along = 0, across = 0, count = 0;
+	struct diameters diameters;
+	int code;
 
 	calibration->used = 0;
 	for (int k = 0; k < calibration->count; k++) {
@@ -188,7 +191,15 @@ static int summarise(struct run *run, struct error *err)
 	calibration->rms_isocentre = sqrt(squares_isocentre / count);
 	calibration->turn = atan2(across, along);
 	calibration->distance_ratio = scale_ratio(run);
-	return diameters_measure(run, &calibration->diameter_ratio, err);
+	code = diameters_measure(run, &diameters, err);
+	if (code < 0)
+		return code;
+	calibration->diameter_ratio = diameters.ratio;
+	calibration->diameter_error = diameters.error;
+	/* A centroid's own errors, of the pixels' sides, are some hundredths of a pixel. */
+	calibration->explained =
+	    hypot(2 * diameters.noise, CENTRING) * calibration->rms_isocentre / fmax(calibration->rms, 1e-9);
+	return 0;
 }
 
 /* The view whose refusal stands for the others': the one with the middle residual. */

@@ -108,6 +108,8 @@ struct calibration {
 	 */
 	double rival_turn;
 	double diameter_ratio; /* median of shadow's to expected diameter */
+	double diameter_error; /* of this ratio: what noise and blur leave open */
+	double explained;      /* mm at the isocentre, of rms_isocentre, that noise and centring may make up */
 	double distance_ratio; /* of the sources' mean distance from the isocentre to the nominal one */
 	double adjusted_rms;   /* mm, by which balls were moved; 0 unless asked for */
 };

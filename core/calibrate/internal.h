@@ -68,6 +68,7 @@ struct pair {
 	int ball;
 	int shadow;              /* its index in the view's list; -1: fitted together with others (touching.c) */
 	double pixel[2], radius; /* of its shadow */
+	double sigma;            /* pixels, of either coordinate, by the picture's noise; of a fitted one alone */
 };
 
 /* Residuals' Jacobian of a ball in a view: by the pose's nine steps and by the ball's place. */
@@ -165,11 +166,14 @@ int find_views(struct run *run, double turn, struct error *err);
 void measure_view(const struct run *run, int view);
 
 /* ---- diameters.c ---- */
-/*
- * The ratio of the shadows' diameters to the expected ones: the median over some of the views that are used, by the
- * balls' thicknesses and whatever blurs them. There is a view that is used.
- */
-int diameters_measure(const struct run *run, double *ret_ratio, struct error *err);
+/* What shadows tell of the balls, by some of the views that are used. */
+struct diameters {
+	double ratio; /* of the shadows' diameters to the expected ones: the median */
+	double error; /* of the ratio: noise, and what no fit can tell from the detector's blur */
+	double noise; /* pixels: by how much the picture's noise moves a shadow, RMS */
+};
+/* There is a view that is used. */
+int diameters_measure(const struct run *run, struct diameters *ret, struct error *err);
 
 /* ---- sweep.c ---- */
 /*

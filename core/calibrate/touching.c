@@ -372,6 +372,7 @@ static bool settle(struct crowd *crowd, struct pair *ret_pair)
 		variance += .5 * column[PLACES + a] * variance_of(crowd, &sums);
 		ret_pair->pixel[a] = crowd->x[PLACES + a];
 	}
+	ret_pair->sigma = sqrt(variance);
 	ret_pair->radius = crowd->x[FACTOR] * crowd->members[0].radius;
 	all = sums.own.squares - sums.own.sum * sums.own.sum / sums.own.weight;
 	return variance <= SIGMA_MOST * SIGMA_MOST && sums.own.left <= (1 - LIKENESS_LEAST) * all;

@@ -75,21 +75,14 @@ static bool add_sweep(cJSON *document, const cJSON *request)
 	return true;
 }
 
-static void add_scale_warning(cJSON *warnings, const cJSON *result)
+static void add_doubts(cJSON *warnings, const cJSON *result)
 {
-	const double doubtful = 0.03, shadows = number_of(result, "diameter_ratio"),
-		     sources = number_of(result, "distance_ratio");
-	char detail[320];
+	cJSON *doubts = calibration_doubts(result);
+	const cJSON *doubt;
 
-	if (fabs(shadows - 1) <= doubtful && fabs(sources - 1) <= doubtful)
-		return;
-	snprintf(
-	    detail, sizeof(detail),
-	    "the shadows are %.3f times as wide as those of the drawing's balls, and the sources stand %.3f times as "
-	    "far from the isocentre as the scan's geometry has them: the drawing may have another scale than the "
-	    "phantom",
-	    shadows, sources);
-	json_append(warnings, json_warning("calibration_scale", detail));
+	cJSON_ArrayForEach(doubt, doubts)
+	    json_append(warnings, json_warning(text_of(doubt, "code"), text_of(doubt, "detail")));
+	cJSON_Delete(doubts);
 }
 
 static void add_view_warning(cJSON *warnings, const cJSON *result)
@@ -120,7 +113,7 @@ static void add_warnings(cJSON *document, const cJSON *result)
 	/* One that was kept of a job has no balls whose shadows could be told of. */
 	if (result == NULL || !cJSON_IsArray(cJSON_GetObjectItemCaseSensitive(result, "balls_mm")))
 		return;
-	add_scale_warning(warnings, result);
+	add_doubts(warnings, result);
 	if (number_of(result, "other_turn_deg") != 0) {
 		snprintf(detail, sizeof(detail),
 			 "the phantom looks about the same turned by %.0f degrees: it was taken to stand as near as "

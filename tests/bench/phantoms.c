@@ -9,7 +9,7 @@
 #include <stdlib.h>
 #include <string.h>
 
-#include "core/calibrate/calibrate.h"
+#include "proto/calibration.h"
 #include "tests/unit/arm.h"
 
 struct scene {
@@ -82,11 +82,11 @@ static int calibrate_scene(struct scene *scene, const struct balls *drawing, str
 	return code;
 }
 
-/* A panel of 380 to 480 mm with pixels of .4 to 2.6 mm, and a phantom of 8 to 12 balls a circle. */
+/* A panel of 381 x 305 mm with pixels of .95 to 2.54 mm, and a phantom of 2 or 3 circles of 8 to 12 balls. */
 static void draw(unsigned seed, struct scene *scene, struct ball_circles *circles)
 {
 	uint64_t state = (seed + 1) * 0x9e3779b97f4a7c15u;
-	const double pixels[] = {.616, 1.27, 1.9, 2.54}, width = 381, height = 305;
+	const double pixels[] = {.95, 1.27, 1.9, 2.54}, width = 381, height = 305;
 	double pixel;
 
 	/* The generator's first numbers of seeds that follow each other are alike: splitmix. */
@@ -115,7 +115,7 @@ static void draw(unsigned seed, struct scene *scene, struct ball_circles *circle
 	scene->arm.step = (uniform(&state) < .5 ? 2 * M_PI : 200 * M_PI / 180) / scene->arm.count;
 	scene->target = (struct target){.ball = uniform(&state) < .5 ? .6 : between(&state, .15, .8),
 					.photons = uniform(&state) < .2 ? 0 : between(&state, 8000, 60000),
-					.rays = 6};
+					.rays = 4};
 	scene->target.blur = uniform(&state) < .5 ? 0 : uniform(&state);
 	if (uniform(&state) < .4) {
 		scene->target.body = .02;
@@ -159,6 +159,7 @@ static void try_drawing(int which, struct scene *scene, struct ball_circles circ
 	struct error err = {0};
 	struct balls balls;
 	double worst, all, balls_used = 0;
+	cJSON *document, *doubts;
 
 	circles.diameter *= drawing->diameter;
 	circles.distance *= drawing->distance;
@@ -177,11 +178,19 @@ static void try_drawing(int which, struct scene *scene, struct ball_circles circ
 	for (int k = 0; k < calibration.count; k++)
 		balls_used += calibration.views[k].used ? calibration.views[k].balls : 0;
 	all = reprojection(&scene->arm, &calibration, &worst);
+	document = calibration_json(&calibration);
+	doubts = calibration_doubts(document);
 	printf("   %-32s %2d views, %4.1f of %2d balls, residual %.3f px %.3f mm, views wrong by %.3f, the worst by "
 	       "%.3f, diameters "
-	       "%.4f, distances %.4f\n",
+	       "%.4f +- %.4f, distances %.4f, explained %.3f mm\n",
 	       drawing->what, calibration.used, balls_used / calibration.used, balls.count, calibration.rms,
-	       calibration.rms_isocentre, all, worst, calibration.diameter_ratio, calibration.distance_ratio);
+	       calibration.rms_isocentre, all, worst, calibration.diameter_ratio, calibration.diameter_error,
+	       calibration.distance_ratio, calibration.explained);
+	for (const cJSON *doubt = doubts->child; doubt != NULL; doubt = doubt->next)
+		printf("      %s\n", cJSON_GetObjectItem(doubt, "code")->valuestring);
+	tally->warned += doubts->child != NULL;
+	cJSON_Delete(doubts);
+	cJSON_Delete(document);
 	tally->wrong = fmax(tally->wrong, all);
 	tally->residual = fmax(tally->residual, calibration.rms);
 	calibration_clear(&calibration);

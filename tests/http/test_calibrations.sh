@@ -135,7 +135,7 @@ test_a_sagging_arm_is_calibrated_and_its_scans_use_it() {
 
 # Pixels of 2.54 mm, the means of 16 rays each: shadows of 2 to 4 pixels, most of which touch or cover others'.
 test_shadows_that_touch_are_told_apart() {
-	local fine=(--columns 600 --rows 480 --pixel .635 --sag daly) row found
+	local fine=(--columns 600 --rows 480 --pixel .635 --sag daly) row found wrong
 	start_daemon
 	for row in "12 3.2 13" "12 6 16" "8 4 13"; do
 		set -- $row
@@ -148,8 +148,21 @@ test_shadows_that_touch_are_told_apart() {
 		expect_status 202
 		req GET "$(jq -r .href "$body")?wait=60"
 		expect_json ".state == \"succeeded\" and .used == $3 and .residual_pixels < .1 and (.diameter_ratio - 1 | fabs) < .01"
+		expect_json '[.warnings[].code] - ["calibration_turn"] == []'
 		found=$(/usr/bin/python3 "$here/rays.py" compare "$body" "$work/truth/scan.json" 4)
 		expect_number "$found" '<' .2 "pixels by which $row are wrong"
+	done
+	# drawings that are 2 % wrong: another scale leaves no residual, another shape does
+	for wrong in '.diameter_mm *= 1.02 | .distance_mm *= 1.02' '.diameter_mm *= .98 | .distance_mm *= .98 | .ball_mm *= .98' '.diameter_mm *= 1.02'; do
+		req POST /v1/calibrations "${json[@]}" "{\"scan\": \"$balls\", \"phantom\": $(jq -c "$wrong" "$work/touching.json")}"
+		req GET "$(jq -r .href "$body")?wait=60"
+		expect_json '.state == "succeeded"'
+		expect_warning calibration_scale
+		expect_json 'any(.warnings[]; .code == "calibration_scale" and (.detail | test("times as wide .*expected within [0-9.]+ %.* times as far .*within 1.0 %")))'
+		case $wrong in
+		*distance*) expect_json '[.warnings[].code] | index("calibration_shape") | not' ;;
+		*) expect_json 'any(.warnings[]; .code == "calibration_shape" and (.detail | test("lie 0.[2-9][0-9]* mm from where the drawing has them")))' ;;
+		esac
 	done
 	stop_daemon
 }

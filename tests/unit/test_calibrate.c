@@ -6,6 +6,7 @@
 #include <string.h>
 
 #include "core/calibrate/internal.h"
+#include "proto/calibration.h"
 #include "tests/unit/arm.h"
 
 Suite *calibrate_suite(void);
@@ -233,6 +234,30 @@ START_TEST(finds_views_that_see_half_of_the_balls)
 }
 END_TEST
 
+/* Which warnings tell of a drawing that may be wrong. */
+static void expect_doubts(const char *what, const struct calibration *calibration, bool scale, bool shape)
+{
+	cJSON *document = calibration_json(calibration), *doubts = calibration_doubts(document);
+	const cJSON *doubt;
+	bool told[2] = {false, false};
+
+	cJSON_ArrayForEach(doubt, doubts)
+	{
+		const char *code = cJSON_GetObjectItem(doubt, "code")->valuestring;
+
+		told[0] = told[0] || strcmp(code, "calibration_scale") == 0;
+		told[1] = told[1] || strcmp(code, "calibration_shape") == 0;
+	}
+	ck_assert_msg(
+	    told[0] == scale && told[1] == shape,
+	    "%s: scale %s, shape %s (diameters %.4f +- %.4f, distances %.4f, residual %.3f mm, %.3f explained)", what,
+	    told[0] ? "told" : "not told", told[1] ? "told" : "not told", calibration->diameter_ratio,
+	    calibration->diameter_error, calibration->distance_ratio, calibration->rms_isocentre,
+	    calibration->explained);
+	cJSON_Delete(document);
+	cJSON_Delete(doubts);
+}
+
 /*
  * Panels of coarse pixels, each of which adds up the intensities of 25 rays: shadows of 2 to 4 pixels, most of which
  * touch or cover others'. The last phantom has half of its balls in pairs, 6.4 mm from centre to centre.
@@ -282,11 +307,68 @@ START_TEST(shadows_that_touch_are_told_apart)
 				       .rays = 5};
 	ck_assert_msg(run(&scene, &balls, false, &calibration, &err) == 0, "%s: %s", coarse[_i].what, err.text);
 	assert_found(coarse[_i].what, &scene.arm, &calibration, .1);
-	/* A right drawing has the right diameters, whatever a pixel's side and the detector's blur add. */
+	/* A right drawing has the right diameters, whatever a pixel's side and the detector's blur add: nothing is
+	 * told. */
 	ck_assert_msg(fabs(calibration.diameter_ratio - 1) <= .015, "%s: diameters of %.4f", coarse[_i].what,
 		      calibration.diameter_ratio);
+	expect_doubts(coarse[_i].what, &calibration, false, false);
 	calibration_clear(&calibration);
 	balls_clear(&balls);
+}
+END_TEST
+
+/*
+ * Drawings that are wrong by 2 %, of 8 balls a circle in 15 views. One of another scale leaves no residual, whatever it
+ * is: the balls know of it where these are as drawn, the nominal distances always. One of another shape leaves a
+ * residual.
+ */
+static const struct {
+	const char *what;
+	double diameter, distance, ball;
+	bool scale, shape, balls_know;
+} drawings[] = {
+    {"right", 1, 1, 1, false, false, false},
+    {"all but the balls too large", 1.02, 1.02, 1, true, false, true},
+    {"all but the balls too small", .98, .98, 1, true, false, true},
+    {"all too large", 1.02, 1.02, 1.02, true, false, false},
+    {"all too small", .98, .98, .98, true, false, false},
+    {"circles too large", 1.02, 1, 1, true, true, false},
+    {"circles too far apart", 1, 1.02, 1, true, true, false},
+};
+
+START_TEST(a_drawing_that_is_wrong_by_two_percent_is_told)
+{
+	struct scene scene = {.arm = arm_sagging};
+	struct ball_circles is = circles, drawn;
+	struct balls balls, drawing;
+	struct calibration calibration;
+	struct error err = {0};
+	double off;
+
+	is.balls = 8;
+	is.ball = 6;
+	is.shift = 20 * M_PI / 180;
+	drawn = is;
+	drawn.diameter *= drawings[_i].diameter;
+	drawn.distance *= drawings[_i].distance;
+	drawn.ball *= drawings[_i].ball;
+	ck_assert(balls_circles(&balls, &is, &err) == 0);
+	ck_assert(balls_circles(&drawing, &drawn, &err) == 0);
+	scene.arm.columns = 150;
+	scene.arm.rows = 120;
+	scene.arm.pixel = 2.54;
+	scene.arm.count = 15;
+	scene.arm.step = 2 * M_PI / 15;
+	scene.target = (struct target){.balls = &balls, .ball = .6, .photons = 20000, .rays = 5};
+	ck_assert_msg(run(&scene, &drawing, false, &calibration, &err) == 0, "%s: %s", drawings[_i].what, err.text);
+	expect_doubts(drawings[_i].what, &calibration, drawings[_i].scale, drawings[_i].shape);
+	off = fabs(calibration.diameter_ratio - 1);
+	if (drawings[_i].balls_know)
+		ck_assert_msg(off > calibration.diameter_error, "%s: diameters of %.4f +- %.4f", drawings[_i].what,
+			      calibration.diameter_ratio, calibration.diameter_error);
+	calibration_clear(&calibration);
+	balls_clear(&balls);
+	balls_clear(&drawing);
 }
 END_TEST
 
@@ -685,6 +767,8 @@ Suite *calibrate_suite(void)
 	tcase_add_test(tests, the_centroid_of_an_ellipse_is_known);
 	tcase_add_test(tests, finds_views_that_see_half_of_the_balls);
 	tcase_add_loop_test(tests, shadows_that_touch_are_told_apart, 0, sizeof(coarse) / sizeof(*coarse));
+	tcase_add_loop_test(tests, a_drawing_that_is_wrong_by_two_percent_is_told, 0,
+			    sizeof(drawings) / sizeof(*drawings));
 	tcase_add_loop_test(tests, shadows_that_cover_each_other_are_fitted_together, 0, 8);
 	tcase_add_loop_test(tests, a_phantom_beside_its_place_is_taken_for_no_other, 0,
 			    sizeof(beside) / sizeof(*beside));

@@ -599,6 +599,7 @@ export const strings = {
 	'The arm was calibrated with another detector: the image may be blurred or shifted.': 'Der Bogen wurde mit einem anderen Detektor kalibriert: Das Bild kann unscharf oder verschoben sein.',
 	'The arm was calibrated on another sweep: the image may be blurred.': 'Der Bogen wurde auf einer anderen Bahn kalibriert: Das Bild kann unscharf sein.',
 	'The phantom may have another size than its drawing: sizes in images may be wrong.': 'Das Phantom ist vielleicht anders groß als seine Zeichnung: Größen in Bildern können falsch sein.',
+	'The phantom may be another than its drawing: the arm\'s places, and sizes in images, may be wrong.': 'Das Phantom ist vielleicht ein anderes als das der Zeichnung: Die Orte des Bogens und Größen in Bildern können falsch sein.',
 	'The phantom looks the same when it is turned: the arm\'s angles may be off by that turn.': 'Das Phantom sieht gedreht gleich aus: Die Winkel des Bogens können um diese Drehung falsch sein.',
 	'The phantom stood turned on the table when the arm was calibrated: left, right, front and back may be wrong.': 'Das Phantom stand beim Kalibrieren gedreht auf dem Tisch: links, rechts, vorn und hinten können falsch sein.',
 	'Some pictures of the phantom could not be used: the arm\'s places there are interpolated.': 'Einige Bilder des Phantoms waren nicht brauchbar: Die Lagen des Bogens sind dort interpoliert.',
