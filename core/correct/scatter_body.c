@@ -9,7 +9,8 @@ enum { DEPTHS = 3, STEPS = 3, NODES = 8 }; /* places along a ray, parts of a way
 static const double WATER = 0.0192;        /* 1/mm, in a beam for imaging */
 /* Standard deviation of the means that light scattered more than once goes by: two ways between collisions, mm. */
 static const double SPREAD = 120;
-static const float THIN = 0.02f; /* a line integral that scatters next to nothing */
+static const float THIN = 0.02f;     /* a line integral that scatters next to nothing */
+static const double ROUNDING = 1e-9; /* of lengths that come out of a matrix */
 static const double PI = 3.14159265358979323846;
 
 /* Cells along one axis of the detector, and the places among them for which scatter is worked out. */
@@ -63,7 +64,8 @@ int scatter_body_check(const struct geometry *geometry, struct error *err)
 	for (int view = 0; view < geometry->count; view++) {
 		const struct scatter_beam beam = scatter_beam_of(&geometry->views[view], false);
 
-		if (!(beam.body_mm > 0 && beam.body_mm < beam.detector_mm))
+		/* A detector through the origin is there whether views or matrices say so. */
+		if (!(beam.body_mm > 0 && beam.body_mm < (1 - ROUNDING) * beam.detector_mm))
 			return error_set(err, ERR_IMPOSSIBLE,
 					 "a body that scatters is expected about the origin, between source and "
 					 "detector: in view %d it is %.4g mm from the source, the detector %.4g mm",

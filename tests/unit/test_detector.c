@@ -10,6 +10,7 @@
 #include <string.h>
 
 #include "core/correct/lag.h"
+#include "core/correct/scatter_body.h"
 #include "core/correct/scatter_images.h"
 #include "core/correct/scatter_spikes.h"
 #include "core/fit/hardening.h"
@@ -681,6 +682,36 @@ START_TEST(light_that_is_scattered_once_is_that_of_the_whole_body)
 }
 END_TEST
 
+/* A detector that passes through the origin has no room for a body before it, as views or as matrices. */
+START_TEST(a_body_has_no_room_before_a_detector_through_the_origin)
+{
+	enum { VIEWS = 12 };
+	const double pixel_mm[2] = {2.54, 2.54};
+	double matrices[12 * VIEWS];
+	struct view views[VIEWS];
+	struct geometry geometry;
+	struct error err = {0};
+
+	for (int k = 0; k < VIEWS; k++) {
+		const double angle = 2 * M_PI * k / VIEWS, aside = pixel_mm[0] * 149 / 2, down = pixel_mm[1] * 119 / 2;
+
+		views[k] = (struct view){.source = {620 * cos(angle), 620 * sin(angle), 0},
+					 .pixel0 = {aside * sin(angle), -aside * cos(angle), -down},
+					 .column_step = {-pixel_mm[0] * sin(angle), pixel_mm[0] * cos(angle), 0},
+					 .row_step = {0, 0, pixel_mm[1]}};
+		view_matrix(&views[k], matrices + 12 * k);
+	}
+	ck_assert_int_eq(geometry_views(&geometry, 150, 120, VIEWS, views, &err), 0);
+	ck_assert_int_eq(scatter_body_check(&geometry, &err), ERR_IMPOSSIBLE);
+	geometry_clear(&geometry);
+	for (int k = 0; k < VIEWS; k++) {
+		ck_assert_int_eq(geometry_matrices(&geometry, 150, 120, 1, matrices + 12 * k, pixel_mm, &err), 0);
+		ck_assert_msg(scatter_body_check(&geometry, &err) == ERR_IMPOSSIBLE, "view %d", k);
+		geometry_clear(&geometry);
+	}
+}
+END_TEST
+
 /* ---- images of scatter ---- */
 
 enum { COARSE = 4, EVERY = 10, IMAGES_MOST = TURNS };
@@ -1259,6 +1290,7 @@ Suite *detector_suite(void)
 	suite_add_tcase(suite, scatter);
 	tcase_set_timeout(once, 120);
 	tcase_add_loop_test(once, light_that_is_scattered_once_is_that_of_the_whole_body, 0, 4);
+	tcase_add_test(once, a_body_has_no_room_before_a_detector_through_the_origin);
 	suite_add_tcase(suite, once);
 	tcase_set_timeout(images, 120);
 	tcase_add_test(images, scatter_is_taken_off_by_coarse_images_of_some_views);
