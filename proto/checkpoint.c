@@ -13,6 +13,7 @@
 #include <unistd.h>
 
 #include "proto/clock.h"
+#include "proto/regular.h"
 #include "proto/saver.h"
 #include "proto/scan_directory.h"
 #include "proto/seal.h"
@@ -422,7 +423,7 @@ static int check_checkpoint(const char *path, const char *bytes, const struct se
 /* Mapped, not read: one volume less in memory at the worst moment. */
 static int resume_from(struct recon *recon, const char *path, int latest, struct history *history, struct error *err)
 {
-	int file = open(path, O_RDONLY | O_CLOEXEC), code;
+	int file = regular_open(path, O_RDONLY, 0), code;
 	struct checkpoint_facts facts = {0};
 	struct seal seal = {0};
 	size_t at, state;
@@ -481,7 +482,7 @@ int checkpoint_iteration(int file)
 /* 0 where there is none. */
 static int iteration_of(const char *path)
 {
-	int file = open(path, O_RDONLY | O_CLOEXEC), iteration;
+	int file = regular_open(path, O_RDONLY, 0), iteration;
 
 	if (file < 0)
 		return 0;
@@ -500,7 +501,7 @@ int checkpoint_open(const char *directory, int iteration, int *ret_file, struct 
 
 		if (path_of(directory, names[i], path, err) != 0)
 			return err->code;
-		file = open(path, O_RDONLY | O_CLOEXEC);
+		file = regular_open(path, O_RDONLY, 0);
 		if (file >= 0 && checkpoint_iteration(file) == iteration) {
 			*ret_file = file;
 			return 0;

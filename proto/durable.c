@@ -3,6 +3,7 @@
  * that way counts.
  */
 #include "proto/durable.h"
+#include "proto/regular.h"
 
 #include <errno.h>
 #include <fcntl.h>
@@ -136,7 +137,7 @@ int durable_settle(struct durable *d, struct error *err)
 
 int durable_settle_named(const char *path, struct error *err)
 {
-	struct durable d = {.file = open(path, O_RDONLY | O_CLOEXEC), .path = path};
+	struct durable d = {.file = regular_open(path, O_RDONLY, 0), .path = path};
 	int code;
 
 	if (d.file < 0)

@@ -10,11 +10,12 @@
 #include "proto/format.h"
 #include "proto/header.h"
 #include "proto/nifti.h"
+#include "proto/regular.h"
 
 /* The beginning of a file, as plain bytes where gzip has packed it. */
 static int read_head(const char *path, char *ret_head, size_t size, size_t *ret_length, struct error *err)
 {
-	int file = open(path, O_RDONLY | O_CLOEXEC), got;
+	int file = regular_open(path, O_RDONLY, 0), got;
 	gzFile unpacked = file >= 0 ? gzdopen(file, "rb") : NULL;
 
 	if (unpacked == NULL) {

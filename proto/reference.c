@@ -9,6 +9,7 @@
 
 #include "core/pulse.h"
 #include "proto/format.h"
+#include "proto/regular.h"
 #include "proto/scan_directory.h"
 #include "proto/seal.h"
 #include "proto/sums.h"
@@ -87,7 +88,7 @@ static int read_voxels(int file, const char *path, const struct grid *grid, cons
 
 int reference_read(const char *path, const struct grid *grid, struct refine_reference *ret, struct error *err)
 {
-	const int file = open(path, O_RDONLY | O_CLOEXEC);
+	const int file = regular_open(path, O_RDONLY, 0);
 	struct grid to;
 	float *voxels;
 	int factor = 1, code;

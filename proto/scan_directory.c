@@ -18,6 +18,7 @@
 #include "proto/durable.h"
 #include "proto/format.h"
 #include "proto/nifti.h"
+#include "proto/regular.h"
 #include "proto/saver.h"
 #include "proto/sums.h"
 
@@ -168,7 +169,7 @@ static int open_projections(const char *directory, const struct scan *scan, int 
 
 	if (code != 0)
 		return code;
-	file = open(path, O_RDONLY | O_CLOEXEC);
+	file = regular_open(path, O_RDONLY, 0);
 	if (file < 0 && errno == ENOENT)
 		return error_set(err, ERR_NOT_FOUND, "%.200s does not exist", path);
 	if (file < 0)

@@ -10,6 +10,7 @@
 #include <unistd.h>
 
 #include "proto/durable.h"
+#include "proto/regular.h"
 #include "proto/scan_directory.h"
 
 static int open_samples(const char *directory, int flags, int *ret_file, struct error *err)
@@ -19,7 +20,7 @@ static int open_samples(const char *directory, int flags, int *ret_file, struct 
 
 	if (code != 0)
 		return code;
-	*ret_file = open(path, flags | O_CLOEXEC, 0640);
+	*ret_file = regular_open(path, flags, 0640);
 	if (*ret_file < 0 && errno == ENOENT)
 		return error_set(err, ERR_NOT_FOUND, "%.200s does not exist", path);
 	return *ret_file < 0 ? error_set_errno(err, errno, "%s cannot be opened", path) : 0;

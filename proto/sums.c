@@ -13,6 +13,7 @@
 #include <wmmintrin.h>
 #endif
 
+#include "proto/regular.h"
 #include "proto/scan_directory.h"
 
 enum { SLOT_LEAST = SUMS_SCAN, CHECKED_BYTES = SUMS_RECORD_BYTES - 4 };
@@ -202,7 +203,7 @@ int sums_open_file(const char *directory, const char *name, bool writing, int co
 
 	if (code != 0)
 		return code;
-	file = open(path, (writing ? O_RDWR : O_RDONLY) | O_CLOEXEC);
+	file = regular_open(path, writing ? O_RDWR : O_RDONLY, 0);
 	if (file < 0 && errno == ENOENT)
 		return error_set(err, ERR_NOT_FOUND, "%.200s does not exist", path);
 	if (file < 0)

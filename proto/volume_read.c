@@ -18,6 +18,7 @@
 #include "proto/metaimage.h"
 #include "proto/nifti.h"
 #include "proto/pixel.h"
+#include "proto/regular.h"
 #include "proto/scan_directory.h"
 
 enum { HEAD_BYTES = 1 << 16 }; /* what lies behind them is no header */
@@ -353,7 +354,7 @@ struct source {
 
 static int source_open(const char *path, struct source *ret, struct error *err)
 {
-	int file = open(path, O_RDONLY | O_CLOEXEC);
+	int file = regular_open(path, O_RDONLY, 0);
 	struct stat status;
 
 	*ret = (struct source){.path = path};

@@ -7,6 +7,7 @@
 #include <unistd.h>
 
 #include "daemon/api/internal.h"
+#include "proto/regular.h"
 #include "proto/source.h"
 
 /* s that a list waits for digests: longer than a disk takes for a volume, or something is wrong with it. */
@@ -523,7 +524,7 @@ int provenance_get(void *context, struct request *request, struct error *err)
 	if (code != 0)
 		return code;
 	store_volume_path(api->store, facts.id, volume.name, path);
-	file = open(path, O_RDONLY | O_CLOEXEC);
+	file = regular_open(path, O_RDONLY, 0);
 	if (file < 0)
 		return error_set(err, ERR_NOT_FOUND, "the volume is not there any more");
 	grid = volume.grid;

@@ -8,6 +8,7 @@
 #include "daemon/dicom/dicom.h"
 #include "proto/format.h"
 #include "proto/json.h"
+#include "proto/regular.h"
 #include "proto/scan_directory.h"
 
 int task_subject(const cJSON *task, struct subject *ret_subject, struct error *err)
@@ -57,7 +58,7 @@ static int read_task(const cJSON *task, struct objects *objects, char ret_path[1
 
 static int open_volume(struct objects *objects, const char *path, const char *job, struct error *err)
 {
-	objects->file = open(path, O_RDONLY | O_CLOEXEC);
+	objects->file = regular_open(path, O_RDONLY, 0);
 	if (objects->file < 0)
 		return errno == ENOENT ? error_set(err, ERR_DAMAGED, "the volume is not there any more")
 				       : error_set_errno(err, errno, "open a volume");

@@ -10,6 +10,7 @@
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
+#include <sys/stat.h>
 #include <time.h>
 #include <unistd.h>
 
@@ -286,6 +287,30 @@ static void report_failure(struct uploads *uploads, const char *what)
 		uploads->options.failed(uploads->options.context, what);
 }
 
+/*
+ * A file that was removed takes what is written to it along: nothing of it may be acknowledged. That of a deleted scan
+ * is told by the rows, which find no scan.
+ */
+static int check_linked(struct uploads *uploads, const struct upload *upload, struct error *err)
+{
+	const int files[] = {upload->descriptor, upload->sums};
+	struct scan_facts facts;
+	struct stat status;
+
+	stored_scan_facts(upload->scan, &facts);
+	for (size_t i = 0; i < sizeof(files) / sizeof(files[0]) && !facts.deleted; i++) {
+		if (fstat(files[i], &status) != 0)
+			return error_set_errno(err, errno, "file of scan %s", stored_scan_id(upload->scan));
+		if (status.st_nlink > 0)
+			continue;
+		store_scan_suspect(uploads->store, stored_scan_id(upload->scan));
+		return error_set(err, ERR_IO,
+				 "a file of scan %s was removed while projections were written to it: send them again",
+				 stored_scan_id(upload->scan));
+	}
+	return 0;
+}
+
 /* One sync for each file in the batch. A sync that failed is never repeated: the kernel may have dropped the pages. */
 static int sync_batch(struct uploads *uploads, struct slot *const slots[], int count, struct error *err)
 {
@@ -304,6 +329,8 @@ static int sync_batch(struct uploads *uploads, struct slot *const slots[], int c
 				report_failure(uploads, err->text);
 			return err->code;
 		}
+		if (check_linked(uploads, slots[i]->upload, err) != 0)
+			return err->code;
 		pthread_mutex_lock(&uploads->lock);
 		uploads->statistics.syncs++;
 		uploads->statistics.sync_seconds += clock_monotonic() - started;

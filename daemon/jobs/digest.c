@@ -18,6 +18,7 @@
 #include "daemon/log.h"
 #include "proto/clock.h"
 #include "proto/durable.h"
+#include "proto/regular.h"
 #include "proto/seal.h"
 #include "proto/scan_directory.h"
 #include "proto/sums.h"
@@ -109,7 +110,7 @@ static int hash_voxels(int file, const char *name, const struct voxels *voxels, 
 static int hash_volume(const char *path, const struct volume_record *volume, const _Atomic bool *stop,
 		       uint8_t ret_sha256[32], struct error *err)
 {
-	int file = open(path, O_RDONLY | O_CLOEXEC), code;
+	int file = regular_open(path, O_RDONLY, 0), code;
 	struct voxels voxels = {.start = 0};
 	EVP_MD_CTX *digest;
 	uint8_t sha256[32];
@@ -139,7 +140,7 @@ static int measure_quality(const char *path, const struct volume_record *volume,
 {
 	struct grid grid = volume->grid;
 	const size_t slice = (size_t)grid.size[0] * (size_t)grid.size[1] * sizeof(float);
-	int file = open(path, O_RDONLY | O_CLOEXEC), first, code;
+	int file = regular_open(path, O_RDONLY, 0), first, code;
 	float *slices;
 	size_t start;
 

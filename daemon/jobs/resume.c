@@ -12,6 +12,7 @@
 #include "daemon/files.h"
 #include "daemon/jobs/internal.h"
 #include "proto/checkpoint.h"
+#include "proto/regular.h"
 
 #define GIVEN_FILE "checkpoint-given.tmp" /* while its pieces come; a temporary one that the next start removes */
 
@@ -94,7 +95,7 @@ int job_checkpoint_take(struct job *job, long piece, const void *data, size_t le
 	if (code == 0)
 		code = directory_make(directory, err);
 	if (code == 0) {
-		file = open(given, O_RDWR | O_CREAT | O_CLOEXEC, 0640);
+		file = regular_open(given, O_RDWR | O_CREAT, 0640);
 		code = file < 0 ? error_set_errno(err, errno, "checkpoint")
 				: write_piece(job, file, piece, data, length, err);
 	}

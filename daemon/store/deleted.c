@@ -12,6 +12,7 @@
 #include <unistd.h>
 
 #include "daemon/log.h"
+#include "proto/regular.h"
 #include "proto/scan_directory.h"
 #include "proto/sums.h"
 
@@ -150,7 +151,7 @@ int deleted_open(const char *state, struct deleted **ret_deleted, struct error *
 		code = shorten(path, (const uint8_t *)text, deleted, err);
 	free(text);
 	if (code == 0) {
-		deleted->file = open(path, O_RDWR | O_CLOEXEC);
+		deleted->file = regular_open(path, O_RDWR, 0);
 		if (deleted->file < 0)
 			code = error_set_errno(err, errno, "open %s", path);
 	}

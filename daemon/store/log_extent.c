@@ -8,6 +8,7 @@
 #include <unistd.h>
 
 #include "daemon/log.h"
+#include "proto/regular.h"
 #include "proto/sums.h"
 
 /* The note: mark, salts, number of frames, zeros, CRC-32 of all that. */
@@ -51,7 +52,7 @@ void log_extent_open(struct log_extent *extent, const char *log, const unsigned 
 
 	if (extent->note < 0) {
 		note_path(log, path);
-		extent->note = open(path, O_RDWR | O_CREAT | O_CLOEXEC, 0600);
+		extent->note = regular_open(path, O_RDWR | O_CREAT, 0600);
 		if (extent->note < 0)
 			log_line(LEVEL_WARNING, "damage of the catalogue's log will not be found: open %s: %s", path,
 				 strerror(errno));
@@ -105,7 +106,7 @@ long log_extent_read(const char *log, const unsigned char salts[LOG_SALTS])
 	bool fits;
 
 	note_path(log, path);
-	file = open(path, O_RDONLY | O_CLOEXEC);
+	file = regular_open(path, O_RDONLY, 0);
 	if (file < 0)
 		return 0;
 	fits = pread(file, note, NOTE, 0) == NOTE && memcmp(note, mark, sizeof(mark)) == 0 &&

@@ -11,6 +11,7 @@
 #include "daemon/files.h"
 #include "daemon/log.h"
 #include "daemon/store/scan.h"
+#include "proto/regular.h"
 
 static int load_scan(struct store *store, const struct catalogue_scan *row, struct error *err)
 {
@@ -151,7 +152,7 @@ int stored_scan_make_room(struct stored_scan *scan, struct error *err)
 		return 0;
 	store_scan_directory(scan->store, scan->id, directory);
 	snprintf(path, sizeof(path), "%s/projections.raw", directory);
-	file = open(path, O_RDWR | O_CREAT | O_CLOEXEC, 0640);
+	file = regular_open(path, O_RDWR | O_CREAT, 0640);
 	if (file < 0)
 		return error_set_errno(err, errno, "make %s", path);
 	if (ftruncate(file, (off_t)wanted) != 0)

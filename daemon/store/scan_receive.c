@@ -11,6 +11,7 @@
 #include "daemon/store/scan.h"
 #include "proto/clock.h"
 #include "proto/durable.h"
+#include "proto/regular.h"
 #include "proto/scan_directory.h"
 
 int stored_scan_claim(struct stored_scan *scan, int index, enum claim *ret_claim, struct error *err)
@@ -54,14 +55,14 @@ int stored_scan_open(struct stored_scan *scan, bool writing, int *ret_descriptor
 
 	store_scan_directory(scan->store, scan->id, directory);
 	snprintf(path, sizeof(path), "%s/projections.raw", directory);
-	file = open(path, (writing ? O_RDWR : O_RDONLY) | O_CLOEXEC);
+	file = regular_open(path, writing ? O_RDWR : O_RDONLY, 0);
 	if (file < 0 && errno == ENOENT && !scan->gone && !stored_scan_deleted(scan)) {
 		/* It went while the daemon ran: without samples all that was stored is found to be lost. */
 		log_line(LEVEL_ERROR, "scan %s: its projections.raw is gone: all of its files are checked", scan->id);
 		if (stored_scan_make_room(scan, err) != 0)
 			return err->code;
 		store_scan_suspect(scan->store, scan->id);
-		file = open(path, (writing ? O_RDWR : O_RDONLY) | O_CLOEXEC);
+		file = regular_open(path, writing ? O_RDWR : O_RDONLY, 0);
 	}
 	if (file < 0 && stored_scan_deleted(scan))
 		return error_set(err, ERR_NOT_FOUND, "there is no scan \"%s\" any more", scan->id);

@@ -16,6 +16,7 @@
 #include "daemon/store/internal.h"
 #include "proto/clock.h"
 #include "proto/format.h"
+#include "proto/regular.h"
 #include "proto/seal.h"
 #include "proto/scan_directory.h"
 #include "proto/sums.h"
@@ -249,7 +250,7 @@ static int open_volume(struct store *store, const char *job, const struct volume
 	int file;
 
 	store_volume_path(store, job, volume->name, path);
-	file = open(path, O_RDONLY | O_CLOEXEC);
+	file = regular_open(path, O_RDONLY, 0);
 	if (file < 0 && errno == ENOENT)
 		return error_set(err, ERR_NOT_FOUND, "the volume is not there any more");
 	if (file < 0)

@@ -9,6 +9,7 @@
 #include <unistd.h>
 
 #include "daemon/volumes/series.h"
+#include "proto/regular.h"
 #include "proto/scan_directory.h"
 #include "proto/zstream.h"
 
@@ -130,7 +131,7 @@ int content_open(const char *path, const struct grid *grid, const struct content
 	content->options = *options;
 	content->voxel_bytes = volume_type_bytes(options->type);
 	scale_grid(content, options->scale);
-	content->descriptor = open(path, O_RDONLY | O_CLOEXEC);
+	content->descriptor = regular_open(path, O_RDONLY, 0);
 	content->rows = malloc((size_t)content->factor[1] * (size_t)grid->size[0] * sizeof(float));
 	content->plane_z = -1;
 	if (options->shuffled)

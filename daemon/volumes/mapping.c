@@ -14,6 +14,7 @@
 #include <unistd.h>
 
 #include "proto/format.h"
+#include "proto/regular.h"
 #include "daemon/lock.h"
 
 enum { IDLE_MAX = 8 };
@@ -70,7 +71,7 @@ void mappings_free(struct mappings *mappings)
 static int map_file(const char *path, const struct grid *grid, struct mapping **ret_mapping, struct error *err)
 {
 	struct mapping *mapping = calloc(1, sizeof(*mapping));
-	int file = open(path, O_RDONLY | O_CLOEXEC);
+	int file = regular_open(path, O_RDONLY, 0);
 	struct stat status;
 	int code = 0;
 
