@@ -194,8 +194,6 @@ const struct warning_kind warning_kinds[] = {
     {"tv_without_effect", SEVERITY_CAUTION,
      "The noise reduction that was asked for is too weak for this scan: the image is about as noisy as without it."},
     {"metal", SEVERITY_CAUTION, "There is metal: what is shown within 10 mm of it is an estimate."},
-    {"metal_outside_grid", SEVERITY_CAUTION,
-     "The patient goes on outside of the image: then taking out the streaks of metal can make the image worse."},
     {"no_metal", SEVERITY_INFO, "No metal was found in the image."},
     {0},
 };

@@ -4,37 +4,6 @@
 
 #include "core/correct/dense.h"
 
-static bool is_inside(const struct grid *grid, const struct grid *of, const struct metal_voxel *voxel)
-{
-	const int at[3] = {(int)(voxel->at % (uint32_t)of->size[0]), (int)(voxel->at / (uint32_t)of->size[0]),
-			   (int)voxel->z};
-
-	for (int i = 0; i < 3; i++) {
-		const double place = of->origin[i] + at[i] * of->spacing[i];
-
-		if (fabs((place - grid->origin[i]) / grid->spacing[i] - 0.5 * (grid->size[i] - 1)) >
-		    0.5 * grid->size[i])
-			return false;
-	}
-	return true;
-}
-
-/* The list's voxels outside of the recipe's grid: those in it have traces of their own, and finer ones. */
-static int take_outside(const struct metal *all, const struct grid *grid, const struct grid *of,
-			struct metal *ret_outside, struct error *err)
-{
-	struct metal_voxel *voxels = malloc((all->voxels_count + 1) * sizeof(*voxels));
-	size_t count = 0;
-
-	if (voxels == NULL)
-		return error_set(err, ERR_NO_MEMORY, "no memory for a list of %zu voxels", all->voxels_count);
-	for (size_t i = 0; i < all->voxels_count; i++)
-		if (!is_inside(grid, of, &all->voxels[i]))
-			voxels[count++] = all->voxels[i];
-	*ret_outside = (struct metal){.voxels = voxels, .voxels_count = count};
-	return 0;
-}
-
 /* What is dense in the model, and the traces of what lies outside of the recipe's grid, by the same rules as in it. */
 struct found {
 	struct metal all, outside;
@@ -55,7 +24,7 @@ static int find(const struct correction_job *job, const struct exterior_volume *
 	int code = dense_find(&found->all, tools, exterior->volume, err);
 
 	if (code == 0)
-		code = take_outside(&found->all, &job->recipe->grid, &exterior->grid, &found->outside, err);
+		code = metal_take_outside(&found->all, &exterior->grid, &job->recipe->grid, &found->outside, err);
 	if (code < 0 || found->outside.voxels_count == 0 || dense_is_most(count))
 		return code;
 	found->drawn = true;

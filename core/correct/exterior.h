@@ -47,6 +47,10 @@ struct exterior_rows {
 	bool possible;
 };
 
+struct correction_job;
+/* The inputs of the model; whether FDK is poor is known, and what exterior_look tells is not. */
+struct exterior_volume_options exterior_options_of(const struct correction_job *job);
+
 /* Counts the rows by some of the projections and the place of the grid, which spares a job without any the rest. */
 int exterior_look(const struct exterior_volume_options *options, struct exterior_rows *ret_rows, struct error *err);
 

@@ -15,6 +15,25 @@ static bool fdk_is_sound(const struct orbit *orbit)
 	return (!orbit->arc_too_short || covered > M_PI + orbit->fan - little) && orbit->tilt < little;
 }
 
+struct exterior_volume_options exterior_options_of(const struct correction_job *job)
+{
+	return (struct exterior_volume_options){
+	    .backend = job->backend,
+	    .device = job->device,
+	    .geometry = job->geometry,
+	    .orbit = job->orbit,
+	    .grid = &job->recipe->grid,
+	    .plan = job->plan,
+	    .projections = job->projections,
+	    .factor = blank_factor(job),
+	    .blank = job->input->blank,
+	    .blanks = job->input->counts.blank,
+	    .poor = !fdk_is_sound(job->orbit),
+	    .dense = job->dense,
+	    .cancel = job->cancel,
+	};
+}
+
 static bool wanted(const struct recipe *recipe, const struct linearise *linearise)
 {
 	(void)linearise;
@@ -176,21 +195,7 @@ static int apply(const struct correction_job *job, void *state, enum correction_
 		 struct error *err)
 {
 	const bool sound = fdk_is_sound(job->orbit), fdk = job->recipe->fdk.on;
-	struct exterior_volume_options options = {
-	    .backend = job->backend,
-	    .device = job->device,
-	    .geometry = job->geometry,
-	    .orbit = job->orbit,
-	    .grid = &job->recipe->grid,
-	    .plan = job->plan,
-	    .projections = job->projections,
-	    .factor = blank_factor(job),
-	    .blank = job->input->blank,
-	    .blanks = job->input->counts.blank,
-	    .poor = !sound,
-	    .dense = job->dense,
-	    .cancel = job->cancel,
-	};
+	struct exterior_volume_options options = exterior_options_of(job);
 	struct exterior_volume *exterior = job->exterior;
 	struct exterior_rows seen, rows = {0};
 	bool taken = false;

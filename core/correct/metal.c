@@ -21,6 +21,10 @@
  *  5. FDK and step 4 again, PASSES times in all: each prior is cleaner than the one
  *     before it, and may keep fainter bone.
  *
+ * In a grid smaller than the body steps 1 to 5 are of another one, of all of the field of view, but for the traces of
+ * what lies in the grid (metal_whole.h): a prior that ends with the grid, and metal cut by its sides, made iterations
+ * up to twelve times as wrong as without the stage.
+ *
  * The better of this volume and the first one is chosen place by place
  * (metal_blend.c): a faint or thin object's shadow has photons enough. tests/bench/results/metal.txt
  * has the table of what else was tried.
@@ -663,7 +667,7 @@ int metal_find_traces(struct metal *metal, const struct metal_tools *tools, stru
 	return code < 0 ? code : treat_all(metal, tools, TRACE, err);
 }
 
-int metal_replace(struct metal *metal, const struct metal_tools *tools, struct error *err)
+int metal_replace(struct metal *metal, struct metal *list, const struct metal_tools *tools, struct error *err)
 {
 	int code = treat_all(metal, tools, FILL, err);
 
@@ -672,7 +676,7 @@ int metal_replace(struct metal *metal, const struct metal_tools *tools, struct e
 		if (code == 0)
 			code = make_prior(tools, pass == 0 ? &FIRST : &LATER, err);
 		if (code == 0)
-			code = change_slices(metal, tools, tools->volume, at_least_in_core, tools->mu_water, err);
+			code = change_slices(list, tools, tools->volume, at_least_in_core, tools->mu_water, err);
 		if (code == 0)
 			code = treat_all(metal, tools, FILL_OVER_PRIOR, err);
 	}

@@ -81,8 +81,8 @@ int metal_put(struct metal *metal, const struct grid *grid, const void *bytes, s
 /* The shadows of the list's voxels, and the samples without counts that touch them. */
 int metal_find_traces(struct metal *metal, const struct metal_tools *tools, struct error *err);
 
-/* Replaces them in the projections. After metal_find_traces. */
-int metal_replace(struct metal *metal, const struct metal_tools *tools, struct error *err);
+/* Replaces them in the projections. After metal_find_traces. `list`: of the metal in the volume to work in. */
+int metal_replace(struct metal *metal, struct metal *list, const struct metal_tools *tools, struct error *err);
 
 /* First of the traces, in order, of this view or a later one. */
 size_t metal_traces_from(const struct metal_trace *traces, size_t count, int view);
@@ -99,6 +99,10 @@ void metal_edges_of(const struct metal *metal, int view, int row, int columns, b
  */
 int metal_fill(struct metal *metal, struct metal *without, const struct metal_tools *tools, struct error *err);
 
+/* The list's voxels, on the grid `of`, whose centres lie outside of another grid. */
+int metal_take_outside(const struct metal *all, const struct grid *of, const struct grid *grid,
+		       struct metal *ret_outside, struct error *err);
+
 /* FDK of all projections, in the order of their numbers, instead of what is in `to`. */
 int metal_fdk(const struct metal_tools *tools, struct volume *to, struct error *err);
 
@@ -110,9 +114,13 @@ struct metal_doubt {
 	bool cut;                   /* metal lies at the grid's sides */
 };
 void metal_doubt_clear(struct metal_doubt *doubt);
-/* Before metal_replace: from the projections as they were measured and the volume `first`, FDK of them. */
+/*
+ * Before metal_replace: from the projections as they were measured and the volume `first`, FDK of them. through: where
+ * their residuals come from, the same, or of a larger grid with FDK in its volume to work in; list: metal in that.
+ */
 int metal_doubt_make(struct metal_doubt *ret_doubt, const struct metal *metal, const struct metal_tools *tools,
-		     struct volume *first, struct error *err);
+		     struct volume *first, const struct metal_tools *through, const struct metal *list,
+		     struct error *err);
 /* The volume, FDK after metal_replace, with a part of the first one where that is the better one. */
 int metal_doubt_blend(struct metal_doubt *doubt, const struct metal *metal, const struct metal_tools *tools,
 		      struct volume *volume, struct error *err);

@@ -21,6 +21,7 @@
  *
  * Where metal lies at the grid's sides e is noise alone: what of it goes on beside the grid is missing in v1 and
  * stays in the samples beside the traces, so that v2 is wrong by more than v1, whatever r is, also in the metal's rim.
+ * In a grid smaller than the body all of this is asked of the field of view, whose FDK volume has r (metal_whole.h).
  *
  * Both are squared and averaged over cells of CELL mm.
  */
@@ -224,16 +225,14 @@ static void foretell_view(const struct metal *metal, int view, const struct meta
 	}
 }
 
-/* FDK of the errors, into the volume to work in; values: of `first`, on the host. */
-static int foretell(const struct metal *metal, const struct metal_tools *tools, const struct volume *first,
-		    const float *values, double noise, struct error *err)
+/* FDK of the errors, into the volume to work in; `from`, of the grid of `through`, is what the residuals are of. */
+static int foretell(const struct metal *metal, const struct metal_tools *tools, const struct metal_tools *through,
+		    const struct volume *from, const struct sides *sides, double noise, struct error *err)
 {
 	const int all = tools->geometry->count;
 	const size_t pixels = (size_t)tools->geometry->columns * (size_t)tools->geometry->rows;
 	const size_t most = (size_t)tools->slots * pixels;
 	struct metal_batch batch = {.shadow = malloc(most * sizeof(float)), .views = malloc(most * sizeof(float))};
-	const struct sides sides = {lies_at_sides(metal, tools->grid),
-				    goes_on_aside(values, tools->grid, tools->mu_water)};
 	float *errors = malloc(most * sizeof(float));
 	int code = tools->backend->volume_fill(tools->volume, 0, err);
 
@@ -241,7 +240,7 @@ static int foretell(const struct metal *metal, const struct metal_tools *tools, 
 		code = error_set(err, ERR_NO_MEMORY, "no memory for %d projections", 3 * tools->slots);
 	for (; batch.first < all && code == 0; batch.first += batch.count) {
 		batch.count = all - batch.first < tools->slots ? all - batch.first : tools->slots;
-		code = metal_project_batch(tools, first, &batch, err);
+		code = metal_project_batch(through, from, &batch, err);
 		if (code == 0)
 			code = tools->backend->stack_download(tools->projections, batch.first, batch.count, batch.views,
 							      err);
@@ -251,11 +250,11 @@ static int foretell(const struct metal *metal, const struct metal_tools *tools, 
 			    .columns = tools->geometry->columns,
 			    .rows = tools->geometry->rows,
 			    .values = batch.views + (size_t)i * pixels,
-			    .grid = tools->grid,
+			    .grid = through->grid,
 			    .view = &tools->geometry->views[batch.first + i],
 			};
 
-			foretell_view(metal, batch.first + i, &of, noise, batch.shadow + (size_t)i * pixels, &sides,
+			foretell_view(metal, batch.first + i, &of, noise, batch.shadow + (size_t)i * pixels, sides,
 				      errors + (size_t)i * pixels);
 		}
 		if (code == 0)
@@ -343,7 +342,8 @@ static int square_cells(const struct metal_doubt *doubt, const struct metal *met
 }
 
 int metal_doubt_make(struct metal_doubt *ret_doubt, const struct metal *metal, const struct metal_tools *tools,
-		     struct volume *first, struct error *err)
+		     struct volume *first, const struct metal_tools *through, const struct metal *list,
+		     struct error *err)
 {
 	const struct grid *grid = tools->grid;
 	struct metal_doubt doubt = {.first = malloc(grid_voxels(grid) * sizeof(float))};
@@ -360,11 +360,16 @@ int metal_doubt_make(struct metal_doubt *ret_doubt, const struct metal *metal, c
 		code = error_set(err, ERR_NO_MEMORY, "no memory for a volume of %zu voxels", grid_voxels(grid));
 	if (code == 0)
 		code = tools->backend->volume_download(first, 0, grid->size[2], doubt.first, err);
-	doubt.cut = lies_at_sides(metal, grid);
 	if (code == 0)
 		code = find_noise(tools, &noise, err);
-	if (code == 0)
-		code = foretell(metal, tools, first, doubt.first, noise, err);
+	if (code == 0) {
+		/* In a grid larger than the recipe's, FDK has a haze in the air around the body. */
+		const struct sides sides = {lies_at_sides(list, through->grid),
+					    through != tools || goes_on_aside(doubt.first, grid, tools->mu_water)};
+
+		doubt.cut = sides.metal;
+		code = foretell(metal, tools, through, through == tools ? first : through->volume, &sides, noise, err);
+	}
 	if (code == 0)
 		code = square_cells(&doubt, metal, tools, tools->volume, false, doubt.expected, err);
 	if (code < 0) {

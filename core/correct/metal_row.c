@@ -5,7 +5,7 @@
 
 #include "core/correct/blank.h"
 #include "core/correct/input.h"
-#include "core/correct/metal.h"
+#include "core/correct/metal_whole.h"
 
 static bool wanted(const struct recipe *recipe, const struct linearise *linearise)
 {
@@ -13,26 +13,24 @@ static bool wanted(const struct recipe *recipe, const struct linearise *linearis
 	return recipe->metal.on;
 }
 
-/* The volume that metal_doubt_make copies. */
+/* The volume that metal_doubt_make copies, and that of the whole field of view. */
 static int bytes_of(const struct correction_ask *ask, struct correction_bytes *bytes, struct error *err)
 {
-	(void)err;
 	bytes->host += grid_voxels(&ask->recipe->grid) * sizeof(float);
-	return 0;
+	return metal_whole_bytes(ask, bytes, err);
 }
 
 static int open_metal(const struct correction_job *job, void **ret_state, struct error *err)
 {
-	(void)job;
-	*ret_state = calloc(1, sizeof(struct metal));
-	return *ret_state != NULL ? 0 : error_set(err, ERR_NO_MEMORY, "no memory for a list of metal");
+	(void)err;
+	*ret_state = job->dense;
+	return 0;
 }
 
 static void close_metal(void *state)
 {
 	if (state != NULL)
 		metal_clear(state);
-	free(state);
 }
 
 struct metal_tools metal_tools_of(const struct correction_job *job)
@@ -133,17 +131,41 @@ static int take_view(const struct correction_job *job, void *state, const struct
 
 /* ---- the FDK volume ---- */
 
+static double threshold_of(const struct correction_job *job)
+{
+	return job->recipe->mu_water * (1 + job->recipe->metal.threshold_hu / 1000);
+}
+
+/* The traces of metal in the grid, which is listed, and of what lies outside, where the body goes on there. */
+static int find_traces(const struct correction_job *job, struct metal *metal, struct metal_whole *whole,
+		       struct error *err)
+{
+	const struct metal_tools tools = metal_tools_of(job);
+	int code = metal->voxels_count > 0 ? metal_find_traces(metal, &tools, err) : 0;
+
+	return code < 0 ? code : metal_whole_make(whole, job, metal, threshold_of(job), err);
+}
+
+static int fill_traces(const struct correction_job *job, struct metal *metal, struct metal_whole *whole,
+		       struct error *err)
+{
+	const struct metal_tools tools = metal_tools_of(job);
+
+	return whole->there ? metal_replace(metal, &whole->list, &whole->tools, err)
+			    : metal_replace(metal, metal, &tools, err);
+}
+
 /* Metal's shadows out of the projections, and of the FDK of those and the one before what is better at each place. */
-static int replace(const struct correction_job *job, struct metal *metal, bool *ret_changed, struct error *err)
+static int replace(const struct correction_job *job, struct metal *metal, struct metal_whole *whole, bool *ret_changed,
+		   struct error *err)
 {
 	const struct metal_tools tools = metal_tools_of(job);
 	struct metal_doubt doubt = {0};
-	int code = metal_find_traces(metal, &tools, err);
+	int code = metal_doubt_make(&doubt, metal, &tools, job->volume, whole->there ? &whole->tools : &tools,
+				    whole->there ? &whole->list : metal, err);
 
 	if (code == 0)
-		code = metal_doubt_make(&doubt, metal, &tools, job->volume, err);
-	if (code == 0)
-		code = metal_replace(metal, &tools, err);
+		code = fill_traces(job, metal, whole, err);
 	if (code == 0)
 		code = metal_fdk(&tools, job->volume, err);
 	if (code == 0)
@@ -159,59 +181,53 @@ static void warn_of_metal(const struct correction_job *job, const struct metal *
 {
 	const struct geometry *geometry = job->geometry;
 	const double samples = (double)geometry->count * (double)geometry->columns * (double)geometry->rows;
+	const double hu = job->recipe->metal.threshold_hu, share = 100 * (double)metal->replaced / samples;
 
-	if (metal->voxels_count == 0)
+	if (metal->voxels_count == 0 && metal->traces_count == 0)
 		warning_tell(job->warnings, "no_metal",
-			     "nothing in the FDK volume has %g HU or more: no metal was taken out",
-			     job->recipe->metal.threshold_hu);
+			     "nothing in the FDK volume has %g HU or more: no metal was taken out", hu);
+	else if (metal->voxels_count == 0)
+		warning_tell(job->warnings, "metal",
+			     "nothing in the grid is metal, of %g HU or more, but something outside of it is: %zu "
+			     "samples (%.3g %%) in %d projections were replaced from what lies beside them, and are "
+			     "left out of SART",
+			     hu, metal->replaced, share, metal->views);
 	else
 		warning_tell(job->warnings, "metal",
 			     "%zu voxels (%.3g %%) are metal: of %g HU or more, or at least half of that beside them; "
 			     "%zu samples (%.3g %%) in %d projections were replaced from what lies beside them, and "
 			     "are left out of SART: values within %d mm of metal are estimates",
-			     metal->found, 100 * (double)metal->found / (double)grid_voxels(&job->recipe->grid),
-			     job->recipe->metal.threshold_hu, metal->replaced, 100 * (double)metal->replaced / samples,
-			     metal->views, METAL_ESTIMATE_MM);
+			     metal->found, 100 * (double)metal->found / (double)grid_voxels(&job->recipe->grid), hu,
+			     metal->replaced, share, metal->views, METAL_ESTIMATE_MM);
 }
 
 /* The metal of the FDK volume out of the projections, and the FDK of those. */
 static int take_out(const struct correction_job *job, struct metal *metal, bool *ret_changed, struct error *err)
 {
 	const struct metal_tools tools = metal_tools_of(job);
-	const double threshold = job->recipe->mu_water * (1 + job->recipe->metal.threshold_hu / 1000);
-	int code = metal_find(metal, &tools, job->volume, threshold, err);
+	struct metal_whole whole = {0};
+	int code = metal_find(metal, &tools, job->volume, threshold_of(job), err);
 
-	if (code == 0 && metal->voxels_count > 0)
-		code = replace(job, metal, ret_changed, err);
+	if (code == 0)
+		code = find_traces(job, metal, &whole, err);
+	if (code == 0 && metal->voxels_count + metal->traces_count > 0)
+		code = replace(job, metal, &whole, ret_changed, err);
 	if (code == 0)
 		warn_of_metal(job, metal);
+	metal_whole_clear(&whole);
 	return code;
 }
 
 /* In a resumed run: the projections become what they were. */
 static int take_out_again(const struct correction_job *job, struct metal *metal, struct error *err)
 {
-	const struct metal_tools tools = metal_tools_of(job);
-	int code;
+	struct metal_whole whole = {0};
+	int code = find_traces(job, metal, &whole, err);
 
-	if (metal->voxels_count == 0)
-		return 0;
-	code = metal_find_traces(metal, &tools, err);
-	return code < 0 ? code : metal_replace(metal, &tools, err);
-}
-
-/*
- * What is filled into the traces knows nothing of the object outside of the grid, and the model of that is made of the
- * traces: where the object goes on there, iterations with the stage had up to twelve times the error beside metal of
- * those without it (tests/bench/results/metal.txt).
- */
-static void warn_of_outside(const struct correction_job *job)
-{
-	if (*job->outside)
-		warning_tell(job->warnings, "metal_outside_grid",
-			     "the object goes on outside of the grid, of which what is filled into the shadows of "
-			     "metal knows nothing: iterations can be worse beside it than without \"metal\", by "
-			     "hundreds of HU; take a grid that holds the object, or compare with a job without");
+	if (code == 0 && metal->voxels_count + metal->traces_count > 0)
+		code = fill_traces(job, metal, &whole, err);
+	metal_whole_clear(&whole);
+	return code;
 }
 
 static int apply(const struct correction_job *job, void *state, enum correction_time time, bool *ret_changed,
@@ -226,7 +242,7 @@ static int apply(const struct correction_job *job, void *state, enum correction_
 		return take_out_again(job, metal, err);
 	if (metal->traces_count == 0)
 		return 0;
-	warn_of_outside(job);
+	*job->left_out_dense = *job->outside;
 	return metal_leave_out(metal, &tools, err);
 }
 

@@ -1,4 +1,5 @@
 /* Lists of metal's traces: see metal.c. */
+#include <math.h>
 #include <stdlib.h>
 
 #include "core/correct/metal_internal.h"
@@ -100,4 +101,34 @@ size_t metal_traces_from(const struct metal_trace *traces, size_t count, int vie
 			high = middle;
 	}
 	return low;
+}
+
+static bool is_inside(const struct grid *grid, const struct grid *of, const struct metal_voxel *voxel)
+{
+	const int at[3] = {(int)(voxel->at % (uint32_t)of->size[0]), (int)(voxel->at / (uint32_t)of->size[0]),
+			   (int)voxel->z};
+
+	for (int i = 0; i < 3; i++) {
+		const double place = of->origin[i] + at[i] * of->spacing[i];
+
+		if (fabs((place - grid->origin[i]) / grid->spacing[i] - 0.5 * (grid->size[i] - 1)) >
+		    0.5 * grid->size[i])
+			return false;
+	}
+	return true;
+}
+
+int metal_take_outside(const struct metal *all, const struct grid *of, const struct grid *grid,
+		       struct metal *ret_outside, struct error *err)
+{
+	struct metal_voxel *voxels = malloc((all->voxels_count + 1) * sizeof(*voxels));
+	size_t count = 0;
+
+	if (voxels == NULL)
+		return error_set(err, ERR_NO_MEMORY, "no memory for a list of %zu voxels", all->voxels_count);
+	for (size_t i = 0; i < all->voxels_count; i++)
+		if (!is_inside(grid, of, &all->voxels[i]))
+			voxels[count++] = all->voxels[i];
+	*ret_outside = (struct metal){.voxels = voxels, .voxels_count = count};
+	return 0;
 }

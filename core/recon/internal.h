@@ -139,8 +139,7 @@ bool has_subsets(const struct recipe *recipe);
 /* Iterations that nobody has set: they begin with FDK, and TV finds its strength. */
 static inline bool recipe_has_restraint(const struct recipe *recipe)
 {
-	return recipe_has_rim(recipe) && has_subsets(recipe) && recipe->tv.on && recipe->tv.automatic &&
-	       !recipe->metal.on;
+	return recipe_has_rim(recipe) && has_subsets(recipe) && recipe->tv.on && recipe->tv.automatic;
 }
 
 /* True if TV finds too little noise in the FDK volume to take anything of it. */

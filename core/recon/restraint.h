@@ -40,6 +40,8 @@
  * Metal. Where the rays through what is very dense are left out of the iterations (core/correct/dense.c), the others
  * move it all the same, by 50 to 3000 HU. V' has FDK's own values there.
  *
+ * Of a job that takes metal out S has none, and it is held back only where the object goes on outside of the grid.
+ *
  * Edges. Where FDK blurs no more than a voxel does, V' has edges that are the mean of both
  * (core/recon/restraint_edges.h), unless there is something as dense as metal, or so much noise that TV takes of FDK's.
  *

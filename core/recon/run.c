@@ -478,6 +478,9 @@ static int begin_restraint(struct recon *recon, struct error *err)
 
 	if (recon->restraint == NULL || recon->iteration > 0)
 		return 0;
+	/* Without metal and its rays there is nothing to hold iterations back for in a grid that holds the body. */
+	if (recon->recipe.metal.on && !recon->outside)
+		return 0;
 	if (!dense && !recon->outside && !(restraint_has_edges(recon->restraint) && recon_spares_fdk(recon)))
 		return 0;
 	return restraint_begin(recon->restraint, recon->backend, recon->volume, err);

@@ -3,7 +3,7 @@
 
 Usage: metal.py make CASE DIR           a scan directory: raw counts of PHOTONS in air; CASE clean: line integrals of the
                                         body alone, without noise
-       metal.py grid                    the volumes' grid, as a job has it
+       metal.py grid                    the volumes' grid, as a job has it; SIZE in the environment: its voxels, "92,76,30"
        metal.py beside CASE CLEAN VOLUME  JSON: root mean square and mean of bone in HU, 3 to 10 mm from the metal, against
                                         the volume CLEAN of the body alone; and the part of the metal's mass that is there
        metal.py dark DIR                how many samples have no counts
@@ -22,7 +22,7 @@ import numpy as np
 WATER = 0.0192
 PHOTONS = 4e4
 VIEWS, COLUMNS, ROWS, PIXEL, NEAR, FAR = 120, 128, 48, 2.4, 620.0, 1100.0
-SIZE, SPACING = (92, 76, 30), 1.5
+SIZE, SPACING = tuple(int(count) for count in os.environ.get("SIZE", "92,76,30").split(",")), 1.5
 
 
 class Part(NamedTuple):

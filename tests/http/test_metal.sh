@@ -89,4 +89,29 @@ test_what_is_thin_stays_whole() {
 	done
 }
 
+# By default, on a grid whose sides cut two of four screws.
+test_a_grid_may_cut_the_metal() {
+	local name with
+	export SIZE=40,30,30
+	need_numpy
+	start_daemon
+	metal make clean "$work/within"
+	metal make screws "$work/cut"
+	reconstruct "$work/within" "{\"scan\": \"SCAN\", \"grid\": $(metal grid), \"fdk\": {}}"
+	get_volume final "$work/within.raw" format=raw
+	for with in null '{}'; do
+		reconstruct "$work/cut" "{\"scan\": \"SCAN\", \"grid\": $(metal grid), \"emit\": [\"fdk\"], \"metal\": $with}"
+		for name in fdk final; do
+			get_volume "$name" "$work/cut-$name.raw" format=raw
+			[ "$with" = null ] && with=
+			metal beside screws "$work/within.raw" "$work/cut-$name.raw" >"$work/cut-$name-${with:+with}.json"
+		done
+	done
+	told
+	not_worse cut .35
+	for name in fdk final; do
+		expect_number "$(of 'bone | fabs' "cut-$name-with")" '<' 60 "$name: HU of bone in the mean"
+	done
+}
+
 run_tests

@@ -155,7 +155,7 @@ START_TEST(cards_give_what_one_device_gives)
 }
 END_TEST
 
-/* Corrections with volumes and stacks of their own: an object beyond the grid, metal. */
+/* Corrections with volumes and stacks of their own: an object beyond the grid, metal, and metal that the grid cuts. */
 START_TEST(corrections_are_those_of_one_device)
 {
 	const struct orbit_spec spec = {48, 36, 40, {600, 1100, {4, 4}, {0, 0}, {0, 0}}, 0, 9};
@@ -164,7 +164,7 @@ START_TEST(corrections_are_those_of_one_device)
 	    {.shape = SHAPE_ELLIPSOID, .semi_axes = {3, 3, 6}, .centre = {8, 5, 0}, .density = _i == 0 ? 0 : .5},
 	};
 	const struct phantom phantom = {2, parts};
-	const struct grid grid = grid_of(_i == 0 ? 30 : 60, 60, 42, 1.6, 1.6, 1.6);
+	const struct grid grid = grid_of(_i == 0 ? 30 : _i == 1 ? 60 : 12, 60, 42, 1.6, 1.6, 1.6);
 	struct recipe recipe = recipe_on(&grid);
 	struct outcome one = {.threads = 1}, several = {.threads = 3, .cards = 3};
 	struct scene scene;
@@ -174,7 +174,7 @@ START_TEST(corrections_are_those_of_one_device)
 	recipe.fdk.on = true;
 	recipe.algorithm = &algorithm_sart;
 	recipe.iterate.iterations = 2;
-	recipe.metal.on = _i == 1;
+	recipe.metal.on = _i > 0;
 	run(&scene, &recipe, &one);
 	run(&scene, &recipe, &several);
 	ck_assert_ptr_nonnull(strstr(one.warnings, _i == 0 ? "outside_grid: " : "metal"));
@@ -331,7 +331,7 @@ Suite *cards_suite(void)
 
 	tcase_set_timeout(tests, 300);
 	tcase_add_loop_test(tests, cards_give_what_one_device_gives, 0, CASES);
-	tcase_add_loop_test(tests, corrections_are_those_of_one_device, 0, 2);
+	tcase_add_loop_test(tests, corrections_are_those_of_one_device, 0, 3);
 	tcase_add_loop_test(tests, a_checkpoint_goes_on_with_other_cards, 0, 2);
 	tcase_add_test(tests, cards_without_a_slice_are_no_obstacle);
 	tcase_add_test(tests, a_cancel_ends_all_cards);

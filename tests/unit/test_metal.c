@@ -242,25 +242,53 @@ START_TEST(without_metal_nothing_changes)
 }
 END_TEST
 
+/*
+ * _i: in a grid that holds the body, in one that cuts the metal, and in one with none in it, and of those two volumes
+ * that are held against their start.
+ */
 START_TEST(a_run_with_metal_goes_on_with_the_same_bits)
 {
+	static const int sizes[][2] = {{84, 68}, {84, 24}, {14, 20}};
+	const struct grid grid = grid_of(sizes[_i][0], sizes[_i][1], 14, 1.6, 1.6, 1.6);
 	struct recipe recipe = recipe_make(true);
 	struct outcome whole = {0}, first = {.yield_at = 1}, second = {.threads = 1};
 	struct scene scene;
 
 	scene_make(&scene, true);
+	recipe.grid = grid;
 	recipe.algorithm = &algorithm_sart;
 	recipe.iterate.iterations = 2;
+	recipe.tv.on = recipe.tv.after_fdk = _i > 0;
+	if (_i > 0)
+		recipe_automatic_tv(&recipe, TV_PROXIMAL);
 	scene_run(&scene, &recipe, &whole);
+	ck_assert_ptr_nonnull(strstr(whole.warnings, "metal: "));
 	scene_run(&scene, &recipe, &first);
-	ck_assert_uint_gt(first.metal_bytes, 0);
+	ck_assert((first.metal_bytes > 0) == (_i < 2));
 	outcome_resume(&second, &first);
 	scene_run(&scene, &recipe, &second);
 	ck_assert_mem_eq(outcome_volume(&second, "final"), outcome_volume(&whole, "final"),
 			 sizeof(float) * grid_voxels(&whole.grid));
 	ck_assert_double_eq(second.rows[0].residual, whole.rows[1].residual);
 	outcome_clear(&second);
-	/* a list that is none of this grid */
+	outcome_clear(&first);
+	/* And in no more memory than is said, of which what is found outside takes a part. */
+	expect_same_after_a_yield(&scene, &recipe, 1, &whole);
+	outcome_clear(&whole);
+	scene_clear(&scene);
+}
+END_TEST
+
+START_TEST(a_list_of_another_grid_is_refused)
+{
+	struct recipe recipe = recipe_make(true);
+	struct outcome first = {.yield_at = 1}, second = {0};
+	struct scene scene;
+
+	scene_make(&scene, true);
+	recipe.algorithm = &algorithm_sart;
+	recipe.iterate.iterations = 2;
+	scene_run(&scene, &recipe, &first);
 	((struct metal_voxel *)first.metal)[1].z = 14;
 	second = (struct outcome){.resume = first.last, .resume_metal = first.metal};
 	second.resume_metal_bytes = first.metal_bytes;
@@ -268,7 +296,6 @@ START_TEST(a_run_with_metal_goes_on_with_the_same_bits)
 	ck_assert_int_eq(second.code, ERR_INVALID);
 	outcome_clear(&second);
 	outcome_clear(&first);
-	outcome_clear(&whole);
 	scene_clear(&scene);
 }
 END_TEST
@@ -360,14 +387,16 @@ static const struct object {
 	/* Beside it, against the same without the stage, at most; HU of the bone in the mean, infinite: none is beside
 	 * it. */
 	double most, bone;
-	int nx, ny; /* voxels of the grid, 0: as many as hold the body */
-} objects[] = {{"four screws", {4, screw_parts}, 2500, .35, 60, 0, 0},
-	       {"four screws in a grid within the body", {4, screw_parts}, 2500, .35, 60, 50, 50},
-	       {"two rods", {2, rod_parts}, 2500, 1.1, 60, 0, 0},
-	       {"two rods beside the grid's side", {2, rod_parts}, 2500, 1.1, INFINITY, 84, 37},
-	       {"a vessel", {1, vessel_parts}, 2000, 1.1, INFINITY, 0, 0},
-	       {"a wire that the grid's side cuts", {1, &wire_parts[4]}, 1400, 1.1, INFINITY, 16, 68},
-	       {"screws that the grid's sides cut", {4, screw_parts}, 2500, 1.1, INFINITY, 22, 34}};
+	int nx, ny;   /* voxels of the grid, 0: as many as hold the body */
+	bool outside; /* all of it lies outside of that */
+} objects[] = {{"four screws", {4, screw_parts}, 2500, .35, 60, 0, 0, false},
+	       {"four screws in a grid within the body", {4, screw_parts}, 2500, .35, 60, 50, 50, false},
+	       {"two rods", {2, rod_parts}, 2500, 1.1, 60, 0, 0, false},
+	       {"two rods beside the grid's side", {2, rod_parts}, 2500, 1.1, INFINITY, 84, 37, false},
+	       {"two rods outside of the grid", {2, rod_parts}, 2500, 1.1, INFINITY, 84, 26, true},
+	       {"a vessel", {1, vessel_parts}, 2000, 1.1, INFINITY, 0, 0, false},
+	       {"a wire that the grid's side cuts", {1, &wire_parts[4]}, 1400, 1.1, INFINITY, 16, 68, false},
+	       {"screws that the grid's sides cut", {4, screw_parts}, 2500, .5, 60, 22, 34, false}};
 
 /* Water and bone and metal add up; exact, or with Poisson noise of 40000 counts in air. NULL: the body alone. */
 static void object_make(struct scene *ret, const struct phantom *object, bool exact)
@@ -463,9 +492,7 @@ static struct recipe object_recipe(const struct object *object, bool with_metal,
 START_TEST(beside_metal_it_is_not_worse_than_without)
 {
 	const struct object *object = &objects[_i];
-	const int iterations = object->nx > 0 ? 0 : 2;
-	struct recipe without = object_recipe(object, false, iterations);
-	struct recipe with = object_recipe(object, true, iterations);
+	struct recipe without = object_recipe(object, false, 2), with = object_recipe(object, true, 2);
 	const struct recipe fdk = object_recipe(object, false, 0);
 	struct outcome clean = {0}, before = {0}, after = {0};
 	struct scene bare, scene;
@@ -477,11 +504,9 @@ START_TEST(beside_metal_it_is_not_worse_than_without)
 	scene_run(&scene, &without, &before);
 	scene_run(&scene, &with, &after);
 	ck_assert_ptr_nonnull(strstr(after.warnings, "metal: "));
-	ck_assert_ptr_nonnull(strstr(after.warnings, "values within 10 mm of metal are estimates"));
-	/* SART of a grid that the body goes beyond is another matter, and told: here the cylinder ends 1 mm beyond it.
-	 */
-	ck_assert((strstr(after.warnings, "metal_outside_grid: ") != NULL) == (iterations > 0));
-	for (int i = 0; i < (object->nx > 0 ? 1 : 2); i++) {
+	ck_assert((strstr(after.warnings, "values within 10 mm of metal are estimates") == NULL) == object->outside);
+	ck_assert((strstr(after.warnings, "nothing in the grid is metal") != NULL) == object->outside);
+	for (int i = 0; i < 2; i++) {
 		const char *name = i == 0 ? "fdk" : "final";
 		const float *want = outcome_volume(&clean, "final");
 		const struct beside was =
@@ -682,7 +707,8 @@ Suite *metal_suite(void)
 			    (int)(sizeof(objects) / sizeof(*objects)));
 	tcase_add_test(stage, samples_without_counts_are_metals);
 	tcase_add_loop_test(stage, what_is_thin_stays_whole, 0, 2);
-	tcase_add_test(stage, a_run_with_metal_goes_on_with_the_same_bits);
+	tcase_add_loop_test(stage, a_run_with_metal_goes_on_with_the_same_bits, 0, 3);
+	tcase_add_test(stage, a_list_of_another_grid_is_refused);
 	tcase_add_test(stage, cancel_ends_the_stage_wherever_it_is);
 	tcase_add_loop_test(stage, memory_is_known_beforehand, 0, 3);
 	tcase_add_test(rows, a_view_is_filled_with_lines);

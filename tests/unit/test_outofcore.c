@@ -323,6 +323,26 @@ START_TEST(rays_through_what_is_dense_are_left_out_in_parts)
 }
 END_TEST
 
+/* Its traces come from a volume of the whole field of view, which is in parts, too. */
+START_TEST(metal_that_the_grid_cuts_is_taken_out_in_parts)
+{
+	const struct orbit_spec spec = {48, 36, 40, {600, 1100, {4, 4}, {0, 0}, {0, 0}}, 0, 9};
+	struct ellipsoid parts[] = {
+	    {.shape = SHAPE_CYLINDER, .semi_axes = {30, 25, 20}, .density = 0.02},
+	    {.shape = SHAPE_CYLINDER, .semi_axes = {3, 3, 15}, .centre = {10, 5, 0}, .density = 0.3}};
+	const struct phantom phantom = {2, parts};
+	struct grid grid = grid_of(12, 60, 42, 1.6, 1.6, 1.6);
+	struct recipe recipe = recipe_on(&grid);
+	struct scene scene;
+
+	recipe.metal.on = true;
+	scene_orbit(&scene, &spec);
+	scene_add(&scene, &phantom);
+	expect_corrected_in_parts(&scene, &recipe, 1, "metal: ", 1e-4);
+	scene_clear(&scene);
+}
+END_TEST
+
 /* In parts metal's two volumes, to work in and to compare with, and its batch lie on the host. */
 START_TEST(what_metal_takes_of_the_host_is_said)
 {
@@ -392,6 +412,7 @@ Suite *outofcore_suite(void)
 	tcase_add_loop_test(tests, pixels_are_averaged_in_parts, 0, 2);
 	tcase_add_loop_test(tests, what_lies_outside_of_the_grid_is_left_out_in_parts, 0, 2);
 	tcase_add_test(tests, rays_through_what_is_dense_are_left_out_in_parts);
+	tcase_add_test(tests, metal_that_the_grid_cuts_is_taken_out_in_parts);
 	tcase_add_test(tests, what_metal_takes_of_the_host_is_said);
 	tcase_add_test(tests, defects_are_counted_once);
 	suite_add_tcase(suite, tests);

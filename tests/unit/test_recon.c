@@ -9,6 +9,7 @@
 #include <string.h>
 
 #include "core/correct/input.h"
+#include "core/correct/metal_whole.h"
 #include "core/recon/algorithm.h"
 #include "core/recon/support.h"
 #include "tests/unit/data.h"
@@ -1214,6 +1215,8 @@ START_TEST(what_is_allocated_is_what_was_said)
 	struct device *device;
 	struct recon *recon;
 	struct error err = {0};
+	struct correction_bytes whole = {0};
+	struct orbit orbit;
 	size_t taken, pixels;
 
 	/* Too few for the check of the geometry, whose memory comes later, too. */
@@ -1235,11 +1238,24 @@ START_TEST(what_is_allocated_is_what_was_said)
 	taken = before.bytes_free - after.bytes_free;
 	/*
 	 * Later come a projection on its way in, what is to be said of a volume that is kept, where projections are
-	 * kept the mend of spoiled ones, and with iterations the coarse volumes of the exterior.
+	 * kept the mend of spoiled ones, with iterations the coarse volumes of the exterior, and with metal the volume
+	 * of the field of view, of which this grid is a part.
 	 */
+	ck_assert_int_eq(orbit_analyse(&orbit, &scene.geometry, &err), 0);
+	if (recipe.metal.on) {
+		const struct correction_ask ask = {.backend = &backend_cpu,
+						   .device = device,
+						   .geometry = &scene.geometry,
+						   .orbit = &orbit,
+						   .recipe = &recipe};
+
+		ck_assert_int_eq(metal_whole_bytes(&ask, &whole, &err), 0);
+		ck_assert_uint_gt(whole.device, 0);
+	}
 	if (algorithm == NULL)
-		ck_assert_uint_eq(taken, memory.total - sizeof(float) * pixels - support_bytes(&grid) -
+		ck_assert_uint_eq(taken, memory.total - sizeof(float) * pixels - support_bytes(&grid) - whole.device -
 					     (recipe.metal.on ? input_mend_bytes(&scene.geometry) : 0));
+	orbit_clear(&orbit);
 	ck_assert_uint_le(taken, memory.total);
 	recon_free(recon);
 	backend_cpu.describe(device, &after);
