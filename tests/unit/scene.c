@@ -146,6 +146,7 @@ static int on_keep(void *context, struct recon *recon, const struct kept_volume 
 	snprintf(outcome->kept[i].name, sizeof(outcome->kept[i].name), "%s", volume->name);
 	snprintf(outcome->kept[i].stage, sizeof(outcome->kept[i].stage), "%s", volume->stage);
 	outcome->kept[i].iteration = volume->iteration;
+	outcome->kept[i].asked = outcome->asked;
 	outcome->kept[i].norms = volume->norms;
 	outcome->kept[i].estimate_mm = volume->estimate_mm;
 	outcome->kept[i].support = volume->support;

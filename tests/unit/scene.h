@@ -56,6 +56,7 @@ struct outcome {
 	struct {
 		char name[32], stage[8];
 		int iteration;
+		int asked; /* so often until then */
 		struct volume_norms norms;
 		double estimate_mm;
 		struct volume_support support;
