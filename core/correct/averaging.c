@@ -54,6 +54,8 @@ double averaging_share(double ratio)
 
 /* Pixels a voxel beyond which only edges that are seen ask for a mean, and from which on objects of voxels are seen. */
 static const double ALWAYS_MOST = 3, TOLD_FROM = 2;
+/* From so many on that mean is a wide one; and from this share of noise on the narrow one is the better. */
+static const double WIDE_FROM = 2.2, NOISY = 0.25;
 /* Iterations with that mean until their change falls: LONG of them up to TOLD_FROM pixels a voxel, SHORT from
  * SHORT_FROM on. */
 static const double LONG = 6, SHORT = 2, SHORT_FROM = 2.5;
@@ -68,16 +70,21 @@ double averaging_variance(double pixels, double ratio, double noise, double edge
 {
 	/* Objects of voxels have ratios up to .137, what is blurred by tilted rows has .147 and more. */
 	static const double voxels = 0.137, body = 0.147;
-	static const double seen = 0.05, narrow = 0.09, wide = 0.15, narrow_to = 1.8, wide_from = 2.2;
-	/* From this share of noise on the narrow one is the better. */
-	static const double noisy = 0.25;
+	static const double seen = 0.05, narrow = 0.09, wide = 0.15, narrow_to = 1.8, wide_from = WIDE_FROM;
 	const double told = ratio > 0 ? fmin(1, fmax(0, (ratio - voxels) / (body - voxels))) : 1;
 	const double fine = fmin(1, fmax(0, (wide_from - pixels) / (wide_from - TOLD_FROM)));
 	const double thin = narrow + (seen - narrow) * edges * fine;
 	const double upto = narrow_to + (TOLD_FROM - narrow_to) * edges;
 	const double more = fmax(shells, fmin(1, fmax(0, (pixels - upto) / (wide_from - upto))));
 
-	return averaging_part(pixels) * told * (thin + (wide - thin) * more * fmax(0, 1 - noise / noisy));
+	return averaging_part(pixels) * told * (thin + (wide - thin) * more * fmax(0, 1 - noise / NOISY));
+}
+
+double averaging_model_share(double pixels, double noise)
+{
+	const double fine = (pixels - TOLD_FROM) / (WIDE_FROM - TOLD_FROM);
+
+	return fmin(1, fmax(0, fine)) * fmin(1, fmax(0, 2 - noise / NOISY));
 }
 
 /* The variance of stack_average's mean: pixels at 1 .. whole on both sides, and a share of the next one. */
@@ -434,6 +441,7 @@ static int look_at(const struct correction_job *job, void *context, const struct
 struct smoothing {
 	double widths[2];
 	int passes;
+	double model; /* averaging_model_share */
 	struct stack *work;
 };
 
@@ -447,68 +455,96 @@ static int smooth(const struct correction_job *job, const struct smoothing *by, 
 	return code;
 }
 
-/* p' becomes k * (p' - A u) + A u in some views, k the mean; inside, less: to work in, to: [count] views on the host.
- */
-static int smooth_less(const struct correction_job *job, const struct smoothing *by, const int *views, int count,
-		       struct stack *inside, struct stack *less, float *to, struct error *err)
+/* Less: projections become k * (p' - A u), k the mean. More: they become what they are and A u. Both at once. */
+enum part { LESS, MORE, BOTH };
+
+/* What a part is worked in: [views] each, and the same on the host. */
+struct parts {
+	struct stack *inside, *sum;
+	float *to;
+};
+
+static int take_part(const struct correction_job *job, const struct smoothing *by, enum part part, const int *views,
+		     int count, const struct parts *in, struct error *err)
 {
 	const struct backend *backend = job->backend;
-	int code = backend->project(job->plan, job->work, views, count, inside, err);
+	int code = backend->project(job->plan, job->work, views, count, in->inside, err);
 
 	if (code == 0)
-		code = backend->stack_axpby(1, job->projections, views, count, 0, less, err);
+		code = backend->stack_axpby(1, job->projections, views, count, 0, in->sum, err);
 	if (code == 0)
-		code = backend->stack_axpby(-1, inside, NULL, count, 1, less, err);
-	for (int i = 0; i < count && code == 0; i++)
-		code = smooth(job, by, less, i, err);
+		code = backend->stack_axpby(part == MORE ? 1 : -1, in->inside, NULL, count, 1, in->sum, err);
+	for (int i = 0; i < count && code == 0 && part != MORE; i++)
+		code = smooth(job, by, in->sum, i, err);
+	if (code == 0 && part == BOTH)
+		code = backend->stack_axpby(1, in->inside, NULL, count, 1, in->sum, err);
 	if (code == 0)
-		code = backend->stack_axpby(1, inside, NULL, count, 1, less, err);
-	if (code == 0)
-		code = backend->stack_download(less, 0, count, to, err);
-	return code < 0 ? code : backend->stack_upload(job->projections, views[0], count, to, err);
+		code = backend->stack_download(in->sum, 0, count, in->to, err);
+	return code < 0 ? code : backend->stack_upload(job->projections, views[0], count, in->to, err);
 }
 
-/*
- * Without what lies outside of it the object ends with the grid, in faces as sharp as in SART's own projections. A mean
- * over those takes 60 to 100 HU of the last slices. p' = p - (A w - A u), see exterior.h; so the mean is of p' - A u,
- * u being smoothed, which has no faces, and A u, which has them and little else, stays as it is.
- */
-static int average_beside_exterior(const struct correction_job *job, const struct smoothing *by, struct error *err)
+/* A part of all views; u is what the model has in the grid now. */
+static int take_all(const struct correction_job *job, const struct smoothing *by, enum part part,
+		    const struct parts *in, struct error *err)
 {
-	const struct backend *backend = job->backend;
-	const struct geometry *geometry = job->geometry;
-	const int all = geometry->count, slots = slots_of(geometry);
-	float *to = malloc((size_t)slots * (size_t)geometry->columns * (size_t)geometry->rows * sizeof(float));
-	struct stack *inside = NULL, *less = NULL;
-	int code = 0;
+	const int all = job->geometry->count, slots = slots_of(job->geometry);
+	int code = exterior_volume_sample(job->exterior, &job->recipe->grid, job->work, err);
 
-	if (to == NULL)
-		code = error_set(err, ERR_NO_MEMORY, "no memory for %d projections", slots);
-	exterior_volume_smooth(job->exterior);
-	if (code == 0)
-		code = exterior_volume_sample(job->exterior, &job->recipe->grid, job->work, err);
-	if (code == 0)
-		code = backend->stack_new(job->device, geometry->columns, geometry->rows, slots, &inside, err);
-	if (code == 0)
-		code = backend->stack_new(job->device, geometry->columns, geometry->rows, slots, &less, err);
 	for (int first = 0; first < all && code == 0; first += slots) {
 		const int count = all - first < slots ? all - first : slots;
 		int views[EXTERIOR_VOLUME_VIEWS];
 
 		for (int i = 0; i < count; i++)
 			views[i] = first + i;
-		code = smooth_less(job, by, views, count, inside, less, to, err);
+		code = take_part(job, by, part, views, count, in, err);
 	}
-	backend->stack_free(inside);
-	backend->stack_free(less);
-	free(to);
 	return code;
 }
 
-static int average(const struct correction_job *job, const double widths[2], int passes, struct error *err)
+/*
+ * Without what lies outside of it the object ends with the grid, in faces as sharp as in SART's own projections. A mean
+ * over those takes 60 to 100 HU of the last slices. p' = p - (A w - A u), see exterior.h; so the mean is of p' - A u,
+ * u being smoothed, which has no faces, and A u, which has them and little else, stays as it is.
+ *
+ * Little else up to 2 pixels a voxel. Edges are in u as well, and the mean does not reach them: beyond that iterations
+ * overshoot there, twice as far from the truth as FDK. By the share of `model` u is w as it is, and in the place of A u
+ * comes A of w's means over voxels, which is what the image has to show, and ends in the same faces.
+ */
+static int average_beside_exterior(const struct correction_job *job, const struct smoothing *by, struct error *err)
+{
+	const struct backend *backend = job->backend;
+	const struct geometry *geometry = job->geometry;
+	const int slots = slots_of(geometry);
+	struct parts in = {
+	    .to = malloc((size_t)slots * (size_t)geometry->columns * (size_t)geometry->rows * sizeof(float)),
+	};
+	double voxel[3];
+	int code = in.to != NULL ? 0 : error_set(err, ERR_NO_MEMORY, "no memory for %d projections", slots);
+
+	if (code == 0)
+		code = backend->stack_new(job->device, geometry->columns, geometry->rows, slots, &in.inside, err);
+	if (code == 0)
+		code = backend->stack_new(job->device, geometry->columns, geometry->rows, slots, &in.sum, err);
+	exterior_volume_smooth(job->exterior, 1 - by->model);
+	if (code == 0)
+		code = take_all(job, by, by->model > 0 ? LESS : BOTH, &in, err);
+	for (int axis = 0; axis < 3; axis++)
+		voxel[axis] = by->model * pow(job->recipe->grid.spacing[axis], 2) / 12;
+	if (code == 0 && by->model > 0) {
+		exterior_volume_mean(job->exterior, voxel);
+		code = take_all(job, by, MORE, &in, err);
+	}
+	backend->stack_free(in.inside);
+	backend->stack_free(in.sum);
+	free(in.to);
+	return code;
+}
+
+static int average(const struct correction_job *job, const double widths[2], int passes, double model,
+		   struct error *err)
 {
 	const struct geometry *geometry = job->geometry;
-	struct smoothing by = {.widths = {widths[0], widths[1]}, .passes = passes};
+	struct smoothing by = {.widths = {widths[0], widths[1]}, .passes = passes, .model = model};
 	int code = job->backend->stack_new(job->device, geometry->columns, geometry->rows, 1, &by.work, err);
 
 	if (code == 0 && job->exterior->goes_on)
@@ -520,10 +556,10 @@ static int average(const struct correction_job *job, const double widths[2], int
 	return code;
 }
 
-/* Widths of the default's mean, from what the projections show and how noisy they are before the mean. */
+/* Widths of the default's mean, and its share of the model, from what the projections show and how noisy they are. */
 static int widths_of_default(const struct correction_job *job, const struct state *state,
 			     const struct averaging_sums sums[DISTANCES], double ratio, double edges,
-			     double ret_widths[2], struct error *err)
+			     double ret_widths[2], double *ret_model, struct error *err)
 {
 	const double shown = structure(&sums[AVERAGING_DISTANCES], false);
 	const double shells = shells_share(state->pixels[0], sums + SHELLS_FROM);
@@ -540,6 +576,7 @@ static int widths_of_default(const struct correction_job *job, const struct stat
 	for (int i = 0; i < 2; i++)
 		ret_widths[i] = averaging_width(averaging_variance(state->pixels[i], ratio, noise, edges, shells) *
 						pow(state->pixels[i], 2) / ALWAYS_PASSES);
+	*ret_model = averaging_model_share(fmin(state->pixels[0], state->pixels[1]), noise);
 	return 0;
 }
 
@@ -569,7 +606,7 @@ static void tell(const struct correction_job *job, const struct state *state, do
 static int decide(const struct correction_job *job, const struct state *state, struct error *err)
 {
 	struct averaging_sums sums[DISTANCES];
-	double widths[2], ratio, share, settling, edges;
+	double widths[2], model = 0, ratio, share, settling, edges;
 	int code = 0;
 
 	sum_up(state, sums);
@@ -578,7 +615,7 @@ static int decide(const struct correction_job *job, const struct state *state, s
 	settling = settling_share(state->pixels[0], sums + AVERAGING_DISTANCES);
 	edges = fmax(share, settling);
 	if (state->always)
-		code = widths_of_default(job, state, sums, ratio, settling, widths, err);
+		code = widths_of_default(job, state, sums, ratio, settling, widths, &model, err);
 	else
 		for (int i = 0; i < 2; i++)
 			widths[i] = 1 + share * state->fineness[i] * fmax(0, state->mean.voxels * state->pixels[i] - 1);
@@ -594,7 +631,7 @@ static int decide(const struct correction_job *job, const struct state *state, s
 		    fmin(*job->settled, fmin(settling_averaged(state->pixels[0]),
 					     settling_after(state->pixels[0], share * state->fineness[0], edges)));
 	tell(job, state, ratio, widths);
-	return average(job, widths, state->always ? ALWAYS_PASSES : state->mean.passes, err);
+	return average(job, widths, state->always ? ALWAYS_PASSES : state->mean.passes, model, err);
 }
 
 /* A run that goes on gets its views again, and decides as before. Nobody behind this needs the model of the exterior.

@@ -68,6 +68,12 @@ struct averaging_mean averaging_mean(const struct recipe *recipe);
  * is thinner than voxels can hold it is as wide as with finer pixels. 0: no mean.
  */
 double averaging_variance(double pixels, double ratio, double noise, double edges, double shells);
+/*
+ * Beside the model of the exterior the mean is not of what that has in the grid. How much of that is the model's own
+ * mean over voxels, 0 .. 1: nothing up to 2 pixels a voxel, nor where half of the power of second differences is noise,
+ * for TV blurs there.
+ */
+double averaging_model_share(double pixels, double noise);
 /* Whether voxels of so many pixels may get that mean, 0 .. 1. */
 double averaging_part(double pixels);
 /* The width, 1 .. 9 pixels, of a mean (stack_average) of this variance in pixels' squares. */

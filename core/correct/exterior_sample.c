@@ -100,8 +100,8 @@ void exterior_volume_hold_rim(struct exterior_volume *s, const struct orbit *orb
 			}
 }
 
-/* (1 2 1) / 4 along a line of voxels, in place, outer values held. */
-static void smooth_line(float *line, int count, size_t stride)
+/* (b, 1 - 2 b, b) along a line of voxels, in place, outer values held. */
+static void smooth_line(float *line, int count, size_t stride, float b)
 {
 	float before = line[0];
 
@@ -109,24 +109,40 @@ static void smooth_line(float *line, int count, size_t stride)
 		float *here = line + (size_t)i * stride;
 		const float is = *here, next = i + 1 < count ? here[stride] : is;
 
-		*here = 0.25f * (before + 2 * is + next);
+		*here = b * (before + (1 / b - 2) * is + next);
 		before = is;
 	}
 }
 
-void exterior_volume_smooth(struct exterior_volume *s)
+static void smooth_axis(struct exterior_volume *s, int axis, float b)
 {
-	const int *count = s->grid.size;
+	const int *count = s->grid.size, first = axis == 0 ? 1 : 0, second = axis == 2 ? 1 : 2;
 	const size_t stride[3] = {1, (size_t)count[0], (size_t)count[0] * (size_t)count[1]};
 
-	for (int axis = 0; axis < 3; axis++) {
-		const int a = axis == 0 ? 1 : 0, b = axis == 2 ? 1 : 2;
-
 #pragma omp parallel for schedule(static)
-		for (int j = 0; j < count[b]; j++)
-			for (int i = 0; i < count[a]; i++)
-				smooth_line(s->voxels + (size_t)j * stride[b] + (size_t)i * stride[a], count[axis],
-					    stride[axis]);
+	for (int j = 0; j < count[second]; j++)
+		for (int i = 0; i < count[first]; i++)
+			smooth_line(s->voxels + (size_t)j * stride[second] + (size_t)i * stride[first], count[axis],
+				    stride[axis], b);
+}
+
+/* A quarter is (1 2 1) / 4; what is wider is taken several times. */
+static const double MOST = 0.25;
+
+void exterior_volume_smooth(struct exterior_volume *s, double share)
+{
+	for (int axis = 0; axis < 3 && share > 0; axis++)
+		smooth_axis(s, axis, (float)(share * MOST));
+}
+
+void exterior_volume_mean(struct exterior_volume *s, const double variances[3])
+{
+	for (int axis = 0; axis < 3; axis++) {
+		const double b = variances[axis] / (2 * pow(s->grid.spacing[axis], 2));
+		const int times = (int)ceil(b / MOST);
+
+		for (int i = 0; i < times; i++)
+			smooth_axis(s, axis, (float)(b / times));
 	}
 }
 

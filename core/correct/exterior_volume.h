@@ -95,8 +95,10 @@ int exterior_volume_fit(struct exterior_volume *exterior, const struct exterior_
  */
 bool exterior_volume_has_outside(const struct exterior_volume *exterior, const struct grid *grid);
 void exterior_volume_clear(struct exterior_volume *exterior);
-/* Its voxels on the host, which exterior_volume_sample takes, become means over (1 2 1) / 4 along each axis. */
-void exterior_volume_smooth(struct exterior_volume *exterior);
+/* Its voxels on the host, which exterior_volume_sample takes, become means over (1 2 1) / 4 along each axis, by a share
+ * of 0 .. 1; or, along x, y and z, means of these variances, mm^2. */
+void exterior_volume_smooth(struct exterior_volume *exterior, double share);
+void exterior_volume_mean(struct exterior_volume *exterior, const double variances[3]);
 /* Frees all but what these two need, on the host; exterior_volume_clear frees that. */
 void exterior_volume_leave_device(struct exterior_volume *exterior);
 

@@ -295,7 +295,8 @@ END_TEST
 /*
  * A body with a rod of bone on voxels of three pixels, no noise, which goes on beyond the grid: ten iterations had 16.3
  * HU in the middle slices where FDK has 15.8, for its edges are as good as a voxel allows. Of one that ends there,
- * iterations are the better in any case.
+ * iterations are the better in any case; one that goes on was 14.9 when the other one was 13.9, for the model of what
+ * lies outside had the edges in the grid that the mean over pixels did not reach.
  */
 START_TEST(edges_that_fdk_shows_as_well_are_the_mean_of_both)
 {
@@ -330,7 +331,7 @@ START_TEST(edges_that_fdk_shows_as_well_are_the_mean_of_both)
 	run(&scene, &recipe, &outcome);
 	fdk = body_error(outcome_volume(&outcome, "fdk") + first, truth + first, count);
 	last = body_error(outcome_volume(&outcome, "final") + first, truth + first, count);
-	ck_assert_msg(last < .97 * fdk, "FDK %.1f HU, SART %.1f", fdk, last);
+	ck_assert_msg(last < .9 * fdk, "FDK %.1f HU, SART %.1f", fdk, last);
 	if (_i == 0)
 		expect_same_after_a_yield(&scene, &recipe, 2, &outcome);
 	outcome_clear(&outcome);
@@ -394,6 +395,12 @@ START_TEST(the_default_s_mean_has_the_variance_that_it_is_asked_for)
 	ck_assert_double_eq_tol(averaging_variance(2.5, .2, 1, 0, 0), .09, 1e-9);
 	ck_assert_double_eq_tol(averaging_variance(2.5, 0, 0, 0, 0), .15, 1e-9);
 	ck_assert_double_eq_tol(averaging_variance(1.5, 0, 0, 0, 0), .09, 1e-9);
+	/* And what the model of the exterior has in the grid, where the mean is wide. */
+	ck_assert_double_eq(averaging_model_share(2, 0), 0);
+	ck_assert_double_eq_tol(averaging_model_share(2.1, 0), .5, 1e-9);
+	ck_assert_double_eq(averaging_model_share(2.5, .25), 1);
+	ck_assert_double_eq_tol(averaging_model_share(2.5, .375), .5, 1e-9);
+	ck_assert_double_eq(averaging_model_share(2.5, .5), 0);
 }
 END_TEST
 
