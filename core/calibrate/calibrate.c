@@ -222,14 +222,6 @@ static const struct calibrated_view *typical_refusal(const struct calibration *c
 	return first;
 }
 
-static void turn_about_z(double v[3], double angle)
-{
-	const double x = v[0], y = v[1];
-
-	v[0] = cos(angle) * x - sin(angle) * y;
-	v[1] = sin(angle) * x + cos(angle) * y;
-}
-
 /*
  * How near a pose comes to a view whose pairs no pose explains: from the nominal one, each ball with the nearest shadow
  * however far that is. Returns the RMS in pixels over *ret_balls of them; INFINITY where these are too few for a pose.
@@ -243,9 +235,7 @@ static double nearest_pose(const struct run *run, int view, double turn, struct 
 	double rms = INFINITY;
 
 	/* The phantom turned one way is source and detector turned the other way. */
-	turn_about_z(pose.source, -turn);
-	for (int i = 0; i < 3; i++)
-		turn_about_z(pose.axes[i], -turn);
+	pose_turn(&pose, -turn);
 	for (int i = 0; i < ROUNDS; i++) {
 		const int count = match_pose(&run->matches[view], &pose, pixel_mm, balls, INFINITY, pairs);
 

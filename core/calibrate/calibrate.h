@@ -17,6 +17,7 @@
  *   view.c     all of these for each view
  *   bundle.c   all views and the balls' own places at once, where that is asked for
  *   diameters.c  the balls' diameters against the drawing's
+ *   follow.c   views that look the same from another side
  *   sweep.c    views that do not follow their neighbours; poses between calibrated ones
  *
  * The world's frame of the result is the one that the balls' coordinates are given in: with the phantom's axis on the

@@ -176,6 +176,15 @@ struct diameters {
 int diameters_measure(const struct run *run, struct diameters *ret, struct error *err);
 
 /* ---- sweep.c ---- */
+/* A view's place in the order of the angles. */
+struct station {
+	double angle; /* radians, -pi to pi, of its nominal source */
+	int view;
+};
+/* All views in that order, the caller's to free; NULL: no memory. */
+struct station *stations_of(const struct geometry *nominal);
+/* Turns source and detector about z. */
+void pose_turn(struct pose *pose, double angle);
 /*
  * Refuses views that do not follow their neighbours: from the shift of the balls' shadows against the nominal
  * geometry, which is smooth over a sweep.
@@ -183,5 +192,13 @@ int diameters_measure(const struct run *run, struct diameters *ret, struct error
 int sweep_refuse(struct calibration *calibration, const struct calibrate_request *request, struct error *err);
 /* Gives views that are not used the pose between their neighbours'. */
 int sweep_fill(struct calibration *calibration, const struct geometry *nominal, struct error *err);
+
+/* ---- follow.c ---- */
+/*
+ * Refuses views whose poses are far from the nominal geometry's, the phantom turned about z by an angle, or leap from
+ * those of the most views that follow each other.
+ */
+int follow_refuse(struct calibration *calibration, const struct calibrate_request *request, double turn,
+		  struct error *err);
 
 #endif

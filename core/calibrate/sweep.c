@@ -17,12 +17,6 @@ static const double GAP_MOST = 30 * M_PI / 180; /* between the neighbours of a v
 static const double STRAY_LEAST = 1;            /* mm at the detector: below it no view strays */
 static const double STRAY_FACTOR = 8;           /* of the median over the views */
 
-/* A view's place in the order of the angles. */
-struct station {
-	double angle; /* radians, -pi to pi, of its nominal source */
-	int view;
-};
-
 static int station_order(const void *a, const void *b)
 {
 	const struct station *x = a, *y = b;
@@ -32,7 +26,7 @@ static int station_order(const void *a, const void *b)
 	return x->view - y->view;
 }
 
-static struct station *stations_of(const struct geometry *nominal)
+struct station *stations_of(const struct geometry *nominal)
 {
 	struct station *stations = malloc((size_t)nominal->count * sizeof(*stations));
 
@@ -60,7 +54,7 @@ static void turn_about_z(double v[3], double angle)
 	v[1] = sin(angle) * x + cos(angle) * y;
 }
 
-static void pose_turn(struct pose *pose, double angle)
+void pose_turn(struct pose *pose, double angle)
 {
 	turn_about_z(pose->source, angle);
 	for (int i = 0; i < 3; i++)

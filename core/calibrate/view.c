@@ -129,12 +129,15 @@ static int pair_view(const struct run *run, int view, double turn, bool again, s
 {
 	const double *pixel_mm = run->request->pixel_mm;
 	const struct balls *balls = &run->calibration->balls;
-	struct pose pose;
+	struct match_view beside = run->matches[view];
+	int count;
 
 	if (!again)
 		return match_view(&run->matches[view], pixel_mm, balls, turn, pairs);
-	pose_of_view(&pose, &run->calibration->views[view].view);
-	return match_pose(&run->matches[view], &pose, pixel_mm, balls, NEIGHBOUR_REACH / pixel_mm[0], pairs);
+	pose_of_view(&beside.nominal, &run->calibration->views[view].view);
+	count = match_pose(&beside, &beside.nominal, pixel_mm, balls, NEIGHBOUR_REACH / pixel_mm[0], pairs);
+	/* An arm that shakes has the whole constellation further away than that. */
+	return count >= PAIRS_LEAST ? count : match_view(&beside, pixel_mm, balls, 0, pairs);
 }
 
 /* The same of all shadows, those that touch fitted together, under each pose anew. */
@@ -333,11 +336,16 @@ int find_views(struct run *run, double turn, struct error *err)
 {
 	int code = find_round(run, turn, false, err);
 
+	/* Neighbours are judged, and others begun from them, once none of them is on another side of the phantom. */
+	if (code == 0)
+		code = follow_refuse(run->calibration, run->request, turn, err);
 	if (code == 0)
 		code = refuse_uneven(run, err);
 	if (code == 0)
 		code = sweep_fill(run->calibration, run->request->nominal, err);
 	if (code == 0)
 		code = find_round(run, turn, true, err);
+	if (code == 0)
+		code = follow_refuse(run->calibration, run->request, turn, err);
 	return code == 0 ? refuse_uneven(run, err) : code;
 }

@@ -488,6 +488,72 @@ START_TEST(a_phantom_beside_its_place_is_taken_for_no_other)
 }
 END_TEST
 
+/* A view as the same pictures have it from where a phantom looks the same: turned about z, or half a turn about a line.
+ */
+static void look_from_elsewhere(struct view *view, double turn, bool over, double line)
+{
+	double *vectors[] = {view->source, view->pixel0, view->column_step, view->row_step};
+
+	for (int i = 0; i < 4; i++) {
+		double *v = vectors[i];
+		const double x = v[0], y = v[1], along = x * cos(line) + y * sin(line);
+
+		v[0] = over ? 2 * along * cos(line) - x : cos(turn) * x - sin(turn) * y;
+		v[1] = over ? 2 * along * sin(line) - y : sin(turn) * x + cos(turn) * y;
+		v[2] = over ? -v[2] : v[2];
+	}
+}
+
+/*
+ * Two circles of 16 balls, each between two of the other's, look the same half a turn about lines between them, and a
+ * ball further on. Views that have no residual there are refused, alone, before or after the first and side by side,
+ * and none that stands where the arm does.
+ */
+START_TEST(a_view_from_another_side_of_the_phantom_is_refused)
+{
+	enum { VIEWS = 30 };
+	const double step = M_PI / 8, pixel_mm[2] = {2.47, 2.47};
+	const struct arm arm = {.columns = 147,
+				.rows = 127,
+				.count = VIEWS,
+				.pixel = 2.47,
+				.first = 4.12,
+				.step = 240 * M_PI / 180 / (VIEWS - 1),
+				.sag = 1.5,
+				.jitter = 1,
+				.seed = 5};
+	const struct {
+		int view;
+		double turn;
+		bool over;
+	} elsewhere[] = {{0, -step, false}, {1, -step, false}, {8, 0, true},      {12, 0, true},
+			 {13, step, false}, {14, step, false}, {15, step, false}, {29, M_PI, false}};
+	struct geometry nominal;
+	struct calibrated_view views[VIEWS] = {{.used = true}};
+	struct calibration calibration = {.count = VIEWS, .views = views};
+	const struct calibrate_request request = {.nominal = &nominal, .pixel_mm = pixel_mm};
+	bool refused[VIEWS] = {false};
+	struct error err = {0};
+
+	ck_assert_msg(arm_nominal_geometry(&arm, &nominal, &err) == 0, "%s", err.text);
+	for (int k = 0; k < VIEWS; k++)
+		views[k] = (struct calibrated_view){.view = arm_view(&arm, k), .used = true};
+	for (size_t i = 0; i < sizeof(elsewhere) / sizeof(*elsewhere); i++) {
+		struct view *view = &views[elsewhere[i].view].view;
+
+		/* View 8 from its own side, the detector upside down; view 12 from wherever the line has it. */
+		look_from_elsewhere(view, elsewhere[i].turn, elsewhere[i].over,
+				    elsewhere[i].view == 8 ? atan2(view->source[1], view->source[0]) : 1.5 * step);
+		refused[elsewhere[i].view] = true;
+	}
+	ck_assert_msg(follow_refuse(&calibration, &request, 0, &err) == 0, "%s", err.text);
+	for (int k = 0; k < VIEWS; k++)
+		ck_assert_msg(views[k].used == !refused[k] && (views[k].refused[0] != '\0') == refused[k],
+			      "view %d is %s: %s", k, views[k].used ? "used" : "refused", views[k].refused);
+	geometry_clear(&nominal);
+}
+END_TEST
+
 START_TEST(a_code_that_reads_the_same_backwards_is_refused)
 {
 	/* 01101001110010110100: backwards, and 3 places on, all of it. */
@@ -772,6 +838,7 @@ Suite *calibrate_suite(void)
 	tcase_add_loop_test(tests, shadows_that_cover_each_other_are_fitted_together, 0, 8);
 	tcase_add_loop_test(tests, a_phantom_beside_its_place_is_taken_for_no_other, 0,
 			    sizeof(beside) / sizeof(*beside));
+	tcase_add_test(tests, a_view_from_another_side_of_the_phantom_is_refused);
 	tcase_add_test(tests, a_code_that_reads_the_same_backwards_is_refused);
 	tcase_add_test(tests, the_code_of_two_sizes_finds_a_phantom_however_it_is_turned);
 	tcase_add_test(tests, adjusting_the_balls_takes_errors_of_machining_out);
