@@ -222,10 +222,13 @@ int coarse_sart(const struct coarse_options *options, struct stack *projections,
 	struct plan *plan = NULL;
 	struct reduced reduced;
 	struct iteration_sums sums;
+	const int iterations = options->from_zero ? COARSE_ITERATIONS_FROM_ZERO : COARSE_ITERATIONS;
 	int code = reduce(&reduced, options, err);
 
 	if (code < 0)
 		return code;
+	if (options->from_zero)
+		reduced.sart.relaxation = COARSE_RELAXATION_FROM_ZERO;
 	const struct plan_options plan_options = plan_options_of(&reduced, options);
 	const struct geometry *geometry = &reduced.geometry;
 
@@ -235,7 +238,7 @@ int coarse_sart(const struct coarse_options *options, struct stack *projections,
 					  err);
 	if (code == 0)
 		code = fill(&reduced, options, projections, stack, err);
-	for (int i = 0; i < COARSE_ITERATIONS && code == 0; i++)
+	for (int i = 0; i < iterations && code == 0; i++)
 		code = backend->sart_iterate(plan, stack, volume, options->cancel, &sums, err);
 	backend->stack_free(stack);
 	backend->plan_free(plan);

@@ -3,6 +3,7 @@
 
 #include <math.h>
 #include <stdlib.h>
+#include <string.h>
 
 #include "core/correct/air.h"
 #include "core/truncation.h"
@@ -301,7 +302,9 @@ int exterior_start(const struct exterior_volume *exterior, const struct exterior
 	if (seen == NULL || w == NULL || values == NULL)
 		code = error_set(err, ERR_NO_MEMORY, "no memory for three slices");
 	for (int z = 0; z < grid->size[2] && code == 0; z++) {
-		if (exterior_volume_seen(exterior, grid, z, seen))
+		if (options->poor)
+			memset(seen, 0, pixels * sizeof(float));
+		else if (exterior_volume_seen(exterior, grid, z, seen))
 			continue;
 		code = backend->volume_download(work, z, 1, w, err);
 		if (code == 0)

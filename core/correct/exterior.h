@@ -63,7 +63,8 @@ int exterior_subtract(const struct exterior_volume *exterior, const struct exter
 		      struct error *err);
 /*
  * A better start for SART than the FDK volume where not all views see a place: there FDK lacks their share, and the
- * few iterations of a job cannot make up for it. The volume becomes w there; `work` holds w.
+ * few iterations of a job cannot make up for it. The volume becomes w there; `work` holds w. All over where FDK is
+ * poor.
  */
 int exterior_start(const struct exterior_volume *exterior, const struct exterior_volume_options *options,
 		   struct volume *work, struct volume *volume, struct error *err);

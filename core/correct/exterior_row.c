@@ -7,14 +7,6 @@
 #include "core/correct/input.h"
 #include "core/correct/truncated.h"
 
-/* FDK of a short arc is too low in many places; real sweeps lack some degrees, and that is at the rim. */
-static bool fdk_is_sound(const struct orbit *orbit)
-{
-	const double little = 0.2, covered = orbit->arc - orbit->holes;
-
-	return (!orbit->arc_too_short || covered > M_PI + orbit->fan - little) && orbit->tilt < little;
-}
-
 struct exterior_volume_options exterior_options_of(const struct correction_job *job)
 {
 	return (struct exterior_volume_options){
@@ -28,7 +20,7 @@ struct exterior_volume_options exterior_options_of(const struct correction_job *
 	    .factor = blank_factor(job),
 	    .blank = job->input->blank,
 	    .blanks = job->input->counts.blank,
-	    .poor = !fdk_is_sound(job->orbit),
+	    .poor = !orbit_fdk_is_sound(job->orbit),
 	    .dense = job->dense,
 	    .cancel = job->cancel,
 	};
@@ -194,7 +186,7 @@ static int make(const struct correction_job *job, struct exterior_volume_options
 static int apply(const struct correction_job *job, void *state, enum correction_time time, bool *ret_changed,
 		 struct error *err)
 {
-	const bool sound = fdk_is_sound(job->orbit), fdk = job->recipe->fdk.on;
+	const bool sound = orbit_fdk_is_sound(job->orbit), fdk = job->recipe->fdk.on;
 	struct exterior_volume_options options = exterior_options_of(job);
 	struct exterior_volume *exterior = job->exterior;
 	struct exterior_rows seen, rows = {0};

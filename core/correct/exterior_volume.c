@@ -177,6 +177,7 @@ static struct coarse_options coarse_options_of(const struct exterior_volume_opti
 	    .blank = options->blank,
 	    .blanks = options->blanks,
 	    .grid = grid,
+	    .from_zero = options->poor,
 	    .lender = options->plan,
 	    .dense = options->dense,
 	    .cancel = options->cancel,

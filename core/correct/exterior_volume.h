@@ -25,6 +25,10 @@
  * integral is hundreds of HU there. Slices of a trunk of +-250 mm that end inside of a panel of +-84 mm, worst error of
  * their means: 500 to 1300 HU with that start set to zero where not all views see it, 30 to 340 with SART from there,
  * 12 to 60 from FDK's low sums and 2 to 7 from the nearest slice.
+ *
+ * Where FDK is poor, the arc short, the start is zero, and the fit goes on for longer: after 8 iterations the density
+ * of a trunk was 48 HU too low in its middle slices, after 32 with a relaxation of 1.5 it is 22. The job's iterations
+ * begin with that model, for of what FDK has put there, 430 HU too low, six of them left 49.
  */
 /*
  * Voxels a side, and views that are projected in one go: little beside a job's own

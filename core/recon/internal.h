@@ -110,16 +110,16 @@ static inline bool recon_runs_fdk(const struct recon *recon)
 	return recon->recipe.fdk.on && !recon->resumed;
 }
 
-/* Without FDK there is nothing to hold the end slices against. */
-static inline bool recipe_has_ends(const struct recipe *recipe)
+/* Without FDK, or with one of a short arc, there is nothing to hold the end slices against. */
+static inline bool recipe_has_ends(const struct recipe *recipe, const struct orbit *orbit)
 {
-	return recipe->fdk.on && recipe->algorithm != NULL;
+	return recipe->fdk.on && recipe->algorithm != NULL && orbit_fdk_is_sound(orbit);
 }
 
 /* Without FDK, or without its noise taken out before the iterations, the rim is the iterate's. */
-static inline bool recipe_has_rim(const struct recipe *recipe)
+static inline bool recipe_has_rim(const struct recipe *recipe, const struct orbit *orbit)
 {
-	return recipe_has_ends(recipe) && (!recipe->tv.on || recipe->tv.after_fdk);
+	return recipe_has_ends(recipe, orbit) && (!recipe->tv.on || recipe->tv.after_fdk);
 }
 
 /* Calls the hook at the beginning of what `stage` says. */
@@ -137,9 +137,9 @@ bool keeps_projections(const struct recipe *recipe);
 /* True if the recipe's algorithm is the backend's own update over ordered subsets. */
 bool has_subsets(const struct recipe *recipe);
 /* Iterations that nobody has set: they begin with FDK, and TV finds its strength. */
-static inline bool recipe_has_restraint(const struct recipe *recipe)
+static inline bool recipe_has_restraint(const struct recipe *recipe, const struct orbit *orbit)
 {
-	return recipe_has_rim(recipe) && has_subsets(recipe) && recipe->tv.on && recipe->tv.automatic;
+	return recipe_has_rim(recipe, orbit) && has_subsets(recipe) && recipe->tv.on && recipe->tv.automatic;
 }
 
 /* True if TV finds too little noise in the FDK volume to take anything of it. */

@@ -177,11 +177,11 @@ static size_t kept_bytes(const struct recon *recon)
 	if (recipe->rings)
 		bytes += rings_bytes(recon->geometry->columns * recipe->binning,
 				     recon->geometry->rows * recipe->binning, recon->geometry->count);
-	if (recipe_has_ends(recipe))
+	if (recipe_has_ends(recipe, &recon->orbit))
 		bytes += ends_bytes(&recipe->grid, recon->geometry, &recon->orbit);
-	if (recipe_has_rim(recipe))
+	if (recipe_has_rim(recipe, &recon->orbit))
 		bytes += rim_bytes(&recipe->grid, &recon->orbit);
-	if (recipe_has_restraint(recipe))
+	if (recipe_has_restraint(recipe, &recon->orbit))
 		bytes += restraint_bytes(&recipe->grid);
 	if (recipe->algorithm != NULL)
 		bytes += alternation_bytes(&recipe->grid);

@@ -156,7 +156,7 @@ static int open_ends(struct recon *recon, struct error *err)
 {
 	const struct recipe *recipe = &recon->recipe;
 
-	if (!recipe_has_ends(recipe))
+	if (!recipe_has_ends(recipe, &recon->orbit))
 		return 0;
 	return ends_new(&recipe->grid, recon->geometry, &recon->orbit, recipe->mu_water, recipe->iterate.nonnegative,
 			&recon->ends, err);
@@ -166,7 +166,7 @@ static int open_rim(struct recon *recon, struct error *err)
 {
 	const struct recipe *recipe = &recon->recipe;
 
-	if (!recipe_has_rim(recipe))
+	if (!recipe_has_rim(recipe, &recon->orbit))
 		return 0;
 	return rim_new(&recipe->grid, &recon->orbit, recipe->iterate.nonnegative, &recon->rim, err);
 }
@@ -176,7 +176,7 @@ static int open_restraint(struct recon *recon, struct error *err)
 	const struct recipe *recipe = &recon->recipe;
 	const struct edge_blur edges = edges_blur(&recipe->grid, &recon->orbit, recipe->fdk.window, recipe->fdk.cutoff);
 
-	if (!recipe_has_restraint(recipe))
+	if (!recipe_has_restraint(recipe, &recon->orbit))
 		return 0;
 	return restraint_new(&recipe->grid, recipe->mu_water, recon->orbit.pixel_at_isocentre[0], &edges,
 			     recipe->iterate.nonnegative, &recon->restraint, err);

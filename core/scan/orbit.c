@@ -480,6 +480,13 @@ static double place_in_arc(const struct orbit *orbit, int view)
 	return b > orbit->arc + 0.5 * outside ? 0 : fmin(b, orbit->arc);
 }
 
+bool orbit_fdk_is_sound(const struct orbit *orbit)
+{
+	const double little = 0.2, covered = orbit->arc - orbit->holes;
+
+	return (!orbit->arc_too_short || covered > M_PI + orbit->fan - little) && orbit->tilt < little;
+}
+
 double orbit_axis_weight(const struct orbit *orbit, int view)
 {
 	if (!orbit->short_scan)

@@ -112,6 +112,13 @@ void orbit_column_weights(const struct orbit *orbit, const struct geometry *geom
 int orbit_directions(const struct orbit *orbit);
 
 /*
+ * False where FDK's densities are too low all over the volume, by hundreds of HU, as those of a short arc are, or the
+ * rows along which it filters lean: such a volume says nothing of what iterations find. Real sweeps lack some degrees,
+ * and that is at the rim.
+ */
+bool orbit_fdk_is_sound(const struct orbit *orbit);
+
+/*
  * Weight of the view in FDK's density on the axis: its angular weight times the short-scan or displaced weight of its
  * ray through the axis.
  */

@@ -260,7 +260,23 @@ START_TEST(the_end_slices_are_true_where_pixels_are_averaged)
 }
 END_TEST
 
-/* Arcs that FDK can make little of: what SART makes of them must not get worse by what lies beyond the ends. */
+/*
+ * An arc of 120 degrees, of which FDK can make little: its volume is 437 HU off. Iterations that began with it were 80
+ * HU off after six, and with TV what is kept was held to it, 428 HU off. From zero, six iterations are 70 HU off on a
+ * grid that no ray leaves as well (tests/bench/results/exterior.txt); more than 1000 at the ends where nothing is taken
+ * out.
+ */
+static const struct {
+	const char *what;
+	bool fdk, tv;
+	const struct algorithm *algorithm;
+	double most; /* HU */
+} short_arcs[] = {
+    {"SART", true, false, &algorithm_sart, 40},       {"with TV", true, true, &algorithm_sart, 40},
+    {"CGLS", true, false, &algorithm_cgls, 40},       {"FISTA", true, false, &algorithm_fista, 40},
+    {"from zero", false, false, &algorithm_sart, 90},
+};
+
 START_TEST(a_poor_orbit_does_not_pile_the_trunk_up)
 {
 	const struct orbit_spec spec = {COLUMNS, ROWS, 40, {620, 1100, {PIXEL, PIXEL}, {0, 0}, {0, 0}}, 13, 3};
@@ -275,14 +291,16 @@ START_TEST(a_poor_orbit_does_not_pile_the_trunk_up)
 	scene_orbit(&scene, &spec);
 	scene_add(&scene, &trunk);
 	phantom_voxelise(&trunk, &grid, 3, truth);
-	recipe.fdk.on = _i == 0;
+	recipe_set_algorithm(&recipe, short_arcs[_i].algorithm);
+	recipe.iterate.iterations = 6;
+	recipe.fdk.on = short_arcs[_i].fdk;
+	recipe.tv.on = short_arcs[_i].tv;
+	if (recipe.tv.on)
+		recipe_automatic_tv(&recipe, TV_PROXIMAL);
 	run(&scene, &recipe, &outcome);
-	worst = slice_errors(&scene.geometry, &grid, outcome.last, truth);
-	/*
-	 * The arc alone, 120 degrees, takes 50 HU from the middle slices (tests/bench/results/exterior.txt); more than
-	 * 1000 at the ends where nothing is taken out.
-	 */
-	ck_assert_msg(worst.any < 90 && worst.apart < 70, "%.1f HU, %.1f HU apart", worst.any, worst.apart);
+	worst = slice_errors(&scene.geometry, &grid, outcome_volume(&outcome, "final"), truth);
+	ck_assert_msg(worst.any < short_arcs[_i].most && worst.apart < 70, "%s: %.1f HU, %.1f HU apart",
+		      short_arcs[_i].what, worst.any, worst.apart);
 	ck_assert_ptr_nonnull(strstr(outcome.warnings, "outside_grid: "));
 	outcome_clear(&outcome);
 	scene_clear(&scene);
@@ -913,7 +931,7 @@ Suite *exterior_suite(void)
 	tcase_set_timeout(truncated, 0);
 	tcase_add_loop_test(tests, the_end_slices_of_a_trunk_longer_than_the_panel_are_true, 0, COUNT(ends));
 	tcase_add_loop_test(tests, the_end_slices_are_true_where_pixels_are_averaged, 0, COUNT(averaged));
-	tcase_add_loop_test(tests, a_poor_orbit_does_not_pile_the_trunk_up, 0, 2);
+	tcase_add_loop_test(tests, a_poor_orbit_does_not_pile_the_trunk_up, 0, COUNT(short_arcs));
 	tcase_add_loop_test(tests, a_real_abdomen_keeps_its_end_slices, 0, 2);
 	tcase_add_loop_test(tests, what_lies_outside_of_the_grid_is_looked_at_whatever_is_done_about_truncated_rows, 0,
 			    2);
