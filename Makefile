@@ -92,7 +92,7 @@ dicom_sources  := $(wildcard daemon/dicom/*.c)
 without        := $(if $(postgresql),,$(wildcard daemon/store/postgresql*.c))
 daemon_sources := $(filter-out daemon/worker.c $(dicom_sources) $(without),$(wildcard daemon/*.c daemon/*/*.c))
 # What the unit tests know of the daemon: its state, without HTTP.
-state_sources  := $(filter-out $(without),$(wildcard daemon/store/*.c daemon/jobs/*.c)) $(patsubst %,daemon/%.c,api/document files histogram id lock log problem process watch)
+state_sources  := $(filter-out $(without),$(wildcard daemon/store/*.c daemon/jobs/*.c)) $(patsubst %,daemon/%.c,api/document files histogram id lock log problem process watch watchdog)
 cbct_sources   := $(wildcard clients/cbct/*.c)
 unit_sources   := $(wildcard tests/unit/*.c) tests/bench/departed.c tests/bench/fdk_volume.c tests/bench/bodies.c
 

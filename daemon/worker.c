@@ -626,9 +626,14 @@ static bool read_arguments(int argc, char **argv, struct arguments *ret)
 
 static int make_calibration(const struct arguments *arguments)
 {
+	struct heartbeat *heartbeat = NULL;
 	struct error err;
+	int code = heartbeat_start(arguments->socket, &heartbeat, &err);
 
-	if (calibration_run(arguments->calibration, arguments->scan, &err) == 0)
+	if (code == 0)
+		code = calibration_run(arguments->calibration, arguments->scan, &err);
+	heartbeat_stop(heartbeat);
+	if (code == 0)
 		return 0;
 	say(&err);
 	return EXIT_START;

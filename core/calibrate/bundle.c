@@ -8,6 +8,7 @@
 #include <string.h>
 
 #include "core/calibrate/internal.h"
+#include "core/pulse.h"
 
 enum { ROUNDS = 12 };
 static const double PIXEL_SIGMA = .1; /* pixels, of a shadow's centroid, against which the drawing is weighed */
@@ -137,6 +138,7 @@ static int step(const struct bundle_view *views, int count, const double pixel_m
 		code = view_blocks(&views[v], views[v].pose, pixel_mm, balls, damping, system, factor, z);
 		if (code == 0)
 			reduce(&views[v], system, z);
+		pulse_beat();
 	}
 	if (code < 0 || dense_cholesky(system->matrix, system->size) < 0)
 		return -1;

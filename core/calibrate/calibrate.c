@@ -7,6 +7,7 @@
 #include <string.h>
 
 #include "core/calibrate/internal.h"
+#include "core/pulse.h"
 
 static const double DIAMETER_TOLERANCE = .15;
 static const double SCALE_TOLERANCE = .1; /* of the mean distance of the sources, against the nominal one */
@@ -37,6 +38,7 @@ static int find_in_view(const struct run *run, struct shadow_finder *finder, flo
 	struct work *work = &run->works[view];
 	int code = run->request->image(run->request->context, view, image, err);
 
+	pulse_beat();
 	if (code < 0)
 		return code;
 	work->count = shadows_find(finder, image, list, &work->facts);
@@ -261,6 +263,7 @@ static void tell_nearest(const struct run *run, double turn, char *text, size_t 
 		int count = 0;
 		const double rms = nearest_pose(run, k, turn, pairs, &count);
 
+		pulse_beat();
 		/* Few balls are always near some shadow. */
 		if (count > balls || (count == balls && rms < best)) {
 			best = rms;

@@ -13,6 +13,7 @@
 #include <string.h>
 
 #include "core/calibrate/internal.h"
+#include "core/pulse.h"
 
 enum { BINS_MOST = 96, TURN_STEPS = 120, TURN_VIEWS = 8 };
 static const double SHIFT_MOST = .25;             /* of the detector's longer side, to either side */
@@ -339,6 +340,7 @@ int match_turn(const struct match_view *views, int count, const double pixel_mm[
 			make_task(task, &views[(2 * i + 1) * count / (2 * used)], pixel_mm, balls,
 				  2 * M_PI * (t - TURN_STEPS / 2) / TURN_STEPS);
 			pairs[t] += search_pairs(task, &search_few, list);
+			pulse_beat();
 		}
 		if (task == NULL || list == NULL) {
 #pragma omp atomic write

@@ -16,6 +16,7 @@
 #include <string.h>
 
 #include "core/calibrate/internal.h"
+#include "core/pulse.h"
 #include "core/select.h"
 
 enum { MEMBERS_MOST = 8, FIXED_MOST = 24, PIXELS_MOST = 4096, STEPS_MOST = 12 };
@@ -437,6 +438,7 @@ int touching_fit(const struct match_view *view, const float *image, const struct
 	for (int b = 0; b < balls->count; b++) {
 		struct pair pair = {.ball = b, .shadow = -1};
 
+		pulse_beat();
 		if (!on_picture(view, &discs[b]) || !gather(discs, balls->count, b, &crowd))
 			continue;
 		crowd.side = discs[b].radius < RADIUS_FINE ? SIDE_FINE : SIDE_COARSE;

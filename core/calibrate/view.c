@@ -9,6 +9,7 @@
 #include <string.h>
 
 #include "core/calibrate/internal.h"
+#include "core/pulse.h"
 #include "core/select.h"
 
 static const double SHARE_LEAST = .4;    /* of the balls whose shadows should be on the picture */
@@ -238,6 +239,7 @@ static void find_view(const struct run *run, int view, double turn, bool again, 
 	struct pose pose, first;
 	int matched = pair_view(run, view, turn, again, pairs), agreeing = 0, used = 0, expected;
 
+	pulse_beat();
 	if (first_pose(run, view, again, pairs, matched, &first, &agreeing) == 0) {
 		pose = first;
 		used = refine(run, view, &pose, pairs, agreeing);

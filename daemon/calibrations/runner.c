@@ -1,19 +1,24 @@
 /*
  * The calibrator: a thread that has one process at a time make the calibrations that are due, oldest first. One that is
- * stopped with the daemon is begun anew. So is one whose process ends without a result, as a job is whose worker dies:
+ * stopped with the daemon is begun anew. So is one whose process ends without a result, as a job is whose worker dies,
+ * or gives no sign of life or finishes no step (proto/heartbeat.h) and is killed:
  * the request counts these ends, and the last one that is allowed is its result, which a restart finds there.
  */
 #include <errno.h>
+#include <math.h>
 #include <poll.h>
 #include <stdio.h>
 #include <string.h>
 #include <sys/eventfd.h>
+#include <sys/socket.h>
 #include <unistd.h>
 
 #include "daemon/calibrations/internal.h"
 #include "daemon/files.h"
 #include "daemon/log.h"
+#include "daemon/watchdog.h"
 #include "proto/clock.h"
+#include "proto/message.h"
 
 enum { RUNS_MOST = 3 }; /* as of a job that cannot be brought to an end */
 
@@ -63,33 +68,108 @@ static bool unwanted(struct calibrations *calibrations, const char *id)
 	return result;
 }
 
-/* Returns 0 when the process ended as it should. */
-static int run_process(struct calibrations *calibrations, const char *id, const char *scan, struct error *err)
+/* A process that makes a calibration, and its signs of life. */
+struct maker {
+	struct process process;
+	int socket; /* -1: it has closed its end */
+	struct watchdog_signs signs;
+	size_t steps;
+	char killed[128]; /* why, when it was for its signs; "" */
+};
+
+/* Its start, with all that a program loads, may take as long as a step. */
+static int maker_start(const struct calibrations *calibrations, const char *id, const char *scan, struct maker *ret,
+		       struct error *err)
 {
-	char directory[1024], scan_directory[1024], threads[16], how[80];
+	char directory[1024], scan_directory[1024], threads[16];
 	char *arguments[] = {"cbct-worker",  "--calibrate", directory, "--scan",
 			     scan_directory, "--threads",   threads,   NULL};
-	struct process process;
-	int status;
+	int pair[2], code;
 
 	calibration_path(calibrations, id, "", directory);
 	store_scan_directory(calibrations->store, scan, scan_directory);
 	snprintf(threads, sizeof(threads), "%d", calibrations->threads);
-	if (process_start(calibrations->worker, arguments, -1, &process, err) != 0)
+	if (socketpair(AF_UNIX, SOCK_SEQPACKET | SOCK_CLOEXEC, 0, pair) < 0)
+		return error_set_errno(err, errno, "socket pair for a calibration");
+	*ret = (struct maker){.socket = pair[0], .signs = {.busy = true}};
+	code = process_start(calibrations->worker, arguments, pair[1], &ret->process, err);
+	close(pair[1]);
+	if (code != 0)
+		close(pair[0]);
+	ret->signs.stepped = clock_monotonic();
+	ret->signs.heard = ret->signs.stepped + WATCHDOG_STEP - WATCHDOG_SILENCE;
+	return code;
+}
+
+/* Reads the signs that have come. */
+static void maker_hear(struct maker *maker)
+{
+	for (bool got = true; got && maker->socket >= 0;) {
+		struct message message;
+		struct error err;
+		const int code = message_receive(maker->socket, 0, &message, &got, &err);
+
+		if (code == ERR_IO) {
+			close(maker->socket);
+			maker->socket = -1;
+		}
+		if (code != 0 || !got)
+			return;
+		maker->signs.heard = clock_monotonic();
+		if (message.kind == MESSAGE_ALIVE && message.steps != maker->steps)
+			maker->signs.stepped = maker->signs.heard;
+		maker->steps = message.steps;
+		message_clear(&message);
+	}
+}
+
+/* Kills it where it gets nowhere, by the limits of a worker that reconstructs. */
+static void maker_judge(struct maker *maker, double now)
+{
+	const enum watchdog_verdict verdict = watchdog_judge(&maker->signs, now);
+
+	if (verdict == WATCHDOG_ALIVE || maker->killed[0] != '\0')
+		return;
+	if (verdict == WATCHDOG_SILENT)
+		snprintf(maker->killed, sizeof(maker->killed), "it gave no sign of life for %.0f s and was killed",
+			 now - maker->signs.heard);
+	else
+		snprintf(maker->killed, sizeof(maker->killed), "it finished no step for %.0f s and was killed",
+			 now - maker->signs.stepped);
+	process_kill(&maker->process);
+}
+
+/* Returns 0 when the process ended as it should. */
+static int run_process(struct calibrations *calibrations, const char *id, const char *scan, struct error *err)
+{
+	struct maker maker;
+	char how[80];
+	int status;
+
+	if (maker_start(calibrations, id, scan, &maker, err) != 0)
 		return err->code;
 	for (;;) {
-		struct pollfd fds[2] = {{.fd = process.pidfd, .events = POLLIN},
-					{.fd = calibrations->wake, .events = POLLIN}};
+		struct pollfd fds[3] = {{.fd = maker.process.pidfd, .events = POLLIN},
+					{.fd = calibrations->wake, .events = POLLIN},
+					{.fd = maker.socket, .events = POLLIN}};
+		const double wait = watchdog_due(&maker.signs) - clock_monotonic();
 
-		poll(fds, 2, -1);
+		poll(fds, 3, maker.killed[0] != '\0' ? -1 : (int)(1000 * fmax(0, wait)) + 1);
 		if (fds[0].revents != 0)
 			break;
 		drain(calibrations);
 		if (unwanted(calibrations, id))
-			process_kill(&process);
+			process_kill(&maker.process);
+		maker_hear(&maker);
+		maker_judge(&maker, clock_monotonic());
 	}
-	status = process_reap(&process, how, sizeof(how));
-	return status == 0 ? 0 : error_set(err, ERR_INTERNAL, "%s: %s", how, process_meaning(status));
+	status = process_reap(&maker.process, how, sizeof(how));
+	if (maker.socket >= 0)
+		close(maker.socket);
+	if (status == 0)
+		return 0;
+	return error_set(err, ERR_INTERNAL, "%s: %s", how,
+			 maker.killed[0] != '\0' ? maker.killed : process_meaning(status));
 }
 
 /* The result of a calibration that was broken off as often as it may be. */

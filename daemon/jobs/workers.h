@@ -11,7 +11,7 @@
 #include "daemon/jobs/route.h"
 #include "daemon/jobs/spawn.h"
 #include "daemon/jobs/supervise.h"
-#include "daemon/jobs/watchdog.h"
+#include "daemon/watchdog.h"
 #include "proto/message.h"
 
 /*

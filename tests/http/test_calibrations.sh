@@ -424,6 +424,35 @@ test_a_process_that_crashes_is_tried_three_times() {
 	stop_daemon
 }
 
+# One that is stopped, or hangs, keeps nobody waiting: it is killed, tried again, and the next calibration has its turn.
+test_a_process_that_gets_nowhere_is_ended() {
+	local how id
+	cat >"$work/faulty" <<-END
+		#!/bin/sh
+		if [ "\$1" = --calibrate ]; then
+			echo >>"$work/runs"
+			eval "\$(cat "$work/how")"
+		fi
+		exec "$BUILD/cbct-worker" "\$@"
+	END
+	chmod +x "$work/faulty"
+	start_daemon --worker "$work/faulty"
+	balls
+	echo "[ \$(wc -l <\"$work/runs\") = 2 ] && exec sleep 3600; kill -STOP \$\$" >"$work/how"
+	rm -f "$work/runs"
+	req POST /v1/calibrations "${json[@]}" "{\"scan\": \"$balls\", \"arm\": \"arm in room 2\", \"phantom\": $phantom}"
+	expect_status 202
+	id=$(jq -r .id "$body")
+	req GET "/v1/calibrations/$id?wait=60"
+	member '.state == "failed"' "$body" >/dev/null || req GET "/v1/calibrations/$id?wait=60"
+	expect_json '.ended != null and (.error.detail | test("^its process ended 3 times without a result, the last time by signal 9 .Killed.: it gave no sign of life for [0-9]+ s and was killed$"))'
+	[ "$(wc -l <"$work/runs")" = 3 ] || fail "three runs, got $(wc -l <"$work/runs")"
+	echo true >"$work/how"
+	calibrated
+	expect_json '.state == "succeeded"'
+	stop_daemon
+}
+
 test_cbct_and_python_calibrate() {
 	start_daemon
 	balls

@@ -1,7 +1,7 @@
 /* Decisions about workers that depend on times. */
 #include <check.h>
 
-#include "daemon/jobs/watchdog.h"
+#include "daemon/watchdog.h"
 
 START_TEST(patience_is_for_a_scan_whose_projections_come)
 {

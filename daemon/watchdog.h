@@ -1,5 +1,5 @@
-#ifndef CBCT_DAEMON_JOBS_WATCHDOG_H
-#define CBCT_DAEMON_JOBS_WATCHDOG_H
+#ifndef CBCT_DAEMON_WATCHDOG_H
+#define CBCT_DAEMON_WATCHDOG_H
 
 #include <stdbool.h>
 

@@ -1,5 +1,5 @@
 /* Decisions about workers that depend on times: watchdog.h. */
-#include "daemon/jobs/watchdog.h"
+#include "daemon/watchdog.h"
 
 double watchdog_attended(double arrived, double since, double now)
 {
