@@ -15,6 +15,7 @@ extern const char *const calibration_state_names[];
 struct entry {
 	char id[ID_SIZE], scan[ID_SIZE];
 	enum calibration_state state;
+	int failure;            /* of its result, enum error_code; 0: none */
 	double acquired, ended; /* seconds since 1970 */
 	char client[STORE_CLIENT_SIZE];
 	unsigned long long bytes; /* of its files */

@@ -125,6 +125,7 @@ int calibration_load(struct calibrations *calibrations, const char *id, struct e
 	    file_bytes(calibrations, id, CALIBRATION_REQUEST) + file_bytes(calibrations, id, CALIBRATION_RESULT);
 	if (result != NULL)
 		entry.state = failure.code == 0 ? CALIBRATION_SUCCEEDED : CALIBRATION_FAILED;
+	entry.failure = failure.code;
 	entry.brief = calibration_brief(id, request, result, &failure);
 	if (entry.brief == NULL)
 		code = error_set(err, ERR_DAMAGED, "the sweep of calibration %s cannot be read", id);

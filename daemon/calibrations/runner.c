@@ -261,6 +261,9 @@ static void settle(struct calibrations *calibrations, const char *id, int code, 
 		if (code == 0)
 			code = calibration_load(calibrations, id, &loaded, &failure);
 	}
+	/* What it found damaged is missing from now on, as what a job finds is. */
+	if (code == 0 && loaded.failure == ERR_DAMAGED)
+		store_scan_suspect(calibrations->store, loaded.scan);
 	shown = failure; /* clients do not see paths, the log does */
 	if (code != 0 && calibration_read(calibrations, id, false, &request, &result, &failure) == 0) {
 		loaded.state = CALIBRATION_FAILED;

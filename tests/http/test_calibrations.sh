@@ -424,6 +424,28 @@ test_a_process_that_crashes_is_tried_three_times() {
 	stop_daemon
 }
 
+# A projection that a calibration finds damaged is missing, and one that is made once it was sent again succeeds.
+test_a_projection_that_it_finds_damaged_is_missing() {
+	local file one end=$((SECONDS + 20))
+	start_daemon
+	balls
+	file=$state/scans/$balls/projections.raw
+	one=$(($(stat -c %s "$file") / 24))
+	dd if="$file" of="$work/view" bs=$one skip=11 count=1 status=none
+	head -c 64 /dev/urandom | dd of="$file" bs=1 seek=$((11 * one + 500)) conv=notrunc status=none
+	calibrated
+	expect_json '.state == "failed" and .error.type == "urn:cbctd:problem:damaged"'
+	until req GET "/v1/scans/$balls" && member '.missing == [[11, 11]]' "$body" >/dev/null; do
+		[ $SECONDS -lt $end ] || fail "a damaged projection that is not missing: $(jq -c .missing "$body")"
+		sleep .05
+	done
+	req PUT "/v1/scans/$balls/projections/11" --data-binary @"$work/view"
+	expect_status 201
+	calibrated
+	expect_json '.state == "succeeded" and .used == 24'
+	stop_daemon
+}
+
 # One that is stopped, or hangs, keeps nobody waiting: it is killed, tried again, and the next calibration has its turn.
 test_a_process_that_gets_nowhere_is_ended() {
 	local how id
