@@ -16,6 +16,7 @@ struct entry {
 	char id[ID_SIZE], scan[ID_SIZE];
 	enum calibration_state state;
 	int failure;            /* of its result, enum error_code; 0: none */
+	double due;             /* CLOCK_MONOTONIC, before which one that is queued is not made */
 	double acquired, ended; /* seconds since 1970 */
 	char client[STORE_CLIENT_SIZE];
 	unsigned long long bytes; /* of its files */

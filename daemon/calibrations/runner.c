@@ -20,7 +20,8 @@
 #include "proto/clock.h"
 #include "proto/message.h"
 
-enum { RUNS_MOST = 3 }; /* as of a job that cannot be brought to an end */
+enum { RUNS_MOST = 3 };        /* as of a job that cannot be brought to an end */
+static const double PAUSE = 5; /* s, before a calibration is tried again whose files cannot be written */
 
 void calibrator_wake(struct calibrations *calibrations)
 {
@@ -46,7 +47,7 @@ static bool take(struct calibrations *calibrations, char ret_id[ID_SIZE], char r
 	for (int i = 0; i < calibrations->count && !found && !calibrations->stop; i++) {
 		struct entry *entry = &calibrations->entries[i];
 
-		if (entry->state != CALIBRATION_QUEUED)
+		if (entry->state != CALIBRATION_QUEUED || entry->due > clock_monotonic())
 			continue;
 		entry->state = CALIBRATION_RUNNING;
 		memcpy(ret_id, entry->id, ID_SIZE);
@@ -222,15 +223,17 @@ static int count_run(const struct calibrations *calibrations, const char *id, co
 	return code;
 }
 
-/* It is due again. */
-static void requeue(struct calibrations *calibrations, const char *id)
+/* It is due again after so many seconds. */
+static void requeue(struct calibrations *calibrations, const char *id, double pause)
 {
 	struct entry *entry;
 
 	pthread_mutex_lock(&calibrations->lock);
 	entry = calibration_entry(calibrations, id);
-	if (entry != NULL)
+	if (entry != NULL) {
 		entry->state = CALIBRATION_QUEUED;
+		entry->due = clock_monotonic() + pause;
+	}
 	pthread_mutex_unlock(&calibrations->lock);
 }
 
@@ -254,8 +257,9 @@ static void settle(struct calibrations *calibrations, const char *id, int code, 
 		bool again = false;
 
 		code = count_run(calibrations, id, why->code != 0 ? why : &failure, &again, &failure);
-		if (code == 0 && again) {
-			requeue(calibrations, id);
+		/* None has failed whose failure a restart would not find: the disk may be written again later. */
+		if (again || (code != 0 && code != ERR_DAMAGED)) {
+			requeue(calibrations, id, code != 0 ? PAUSE : 0);
 			return;
 		}
 		if (code == 0)
@@ -317,7 +321,7 @@ static void *calibrator_loop(void *context)
 			watch_wake(&calibrations->watchers);
 			continue;
 		}
-		poll(&wake, 1, -1);
+		poll(&wake, 1, (int)(1000 * PAUSE));
 		drain(calibrations);
 	}
 	return NULL;

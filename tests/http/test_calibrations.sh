@@ -446,6 +446,39 @@ test_a_projection_that_it_finds_damaged_is_missing() {
 	stop_daemon
 }
 
+# One whose files cannot be written has not failed, which nothing could record: it waits, and is made once they can be.
+test_a_directory_that_cannot_be_written_is_waited_for() {
+	local end
+	[ "${SANITIZED:-0}" = 0 ] || skip "a sanitizer must be the first library of a process"
+	cat >"$work/faulty" <<-END
+		#!/bin/sh
+		if [ "\$1" = --calibrate ]; then
+			[ -e "$work/mended" ] || { sleep 1; echo "open 30 /calibrations/ 1000000 0" >"$work/faults"; } # once the reply has gone
+			echo >>"$work/runs"
+		fi
+		exec "$BUILD/cbct-worker" "\$@"
+	END
+	chmod +x "$work/faulty"
+	rm -f "$work/runs" "$work/mended" "$work/faults"
+	CBCT_TEST_FAULTS=$work/faults LD_PRELOAD=$(realpath "$BUILD")/faults.so start_daemon --worker "$work/faulty"
+	balls
+	req POST /v1/calibrations "${json[@]}" "{\"scan\": \"$balls\", \"arm\": \"arm in room 2\", \"phantom\": $phantom}"
+	expect_status 202
+	calibration=$(jq -r .id "$body")
+	end=$((SECONDS + 60))
+	until [ -e "$work/runs" ] && [ "$(wc -l <"$work/runs")" -ge 2 ]; do
+		req GET "/v1/calibrations?limit=1"
+		expect_json '.calibrations[0] | .error == null and .state != "failed"'
+		[ $SECONDS -lt $end ] || fail "a second try"
+		sleep .2
+	done
+	touch "$work/mended"
+	rm -f "$work/faults"
+	req GET "/v1/calibrations/$calibration?wait=60"
+	expect_json '.state == "succeeded" and .ended != null'
+	stop_daemon
+}
+
 # One that is stopped, or hangs, keeps nobody waiting: it is killed, tried again, and the next calibration has its turn.
 test_a_process_that_gets_nowhere_is_ended() {
 	local how id
