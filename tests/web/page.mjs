@@ -724,7 +724,7 @@ test('a calibration comes into the list, tells its residuals projection by proje
 	await page.waitForSelector(`${row} .badge.succeeded`)
 	expect(refused.length > 0 && made.views[5].shadows === 0 && refused.includes(5), `the empty picture refused: ${refused}`)
 	const told = await page.textContent(row)
-	for (const words of ['arm <b>3</b>', `Residual ${short(made.residual_pixels)} pixels, ${short(made.residual_isocentre_mm)} mm at the isocentre`, '24 balls', `${refused.length} projections refused`,
+	for (const words of ['arm <b>3</b>', `Residual ${short(made.residual_pixels)} pixels, ${short(made.residual_isocentre_mm)} mm at the isocentre`, '24 balls', `${refused.length} projection${refused.length === 1 ? '' : 's'} refused`,
 		'16 projections, 360°, counter-clockwise', '240 × 192 pixels of 1.58 × 1.58 mm', ' old', made.views[refused[0]].refused])
 		expect(told.includes(words), `"${words}" in: ${told}`)
 	await shoot(page, 'calibrations')
