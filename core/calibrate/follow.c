@@ -121,18 +121,38 @@ static void hold_run(struct calibration *calibration, struct stance *stances, in
 	}
 }
 
+/* Where the sweep begins among its stations: behind its widest gap, the opening of a short scan, over which none
+ * follows. */
+static int first_station(const struct station *stations, int count)
+{
+	double widest = -1;
+	int first = 0;
+
+	for (int i = 0; i < count; i++) {
+		const double gap = remainder(stations[i].angle - stations[(i + count - 1) % count].angle, 2 * M_PI);
+		const double onward = gap < 0 ? gap + 2 * M_PI : gap;
+
+		if (onward > widest + 1e-9) {
+			widest = onward;
+			first = i;
+		}
+	}
+	return first;
+}
+
 int follow_refuse(struct calibration *calibration, const struct calibrate_request *request, double turn,
 		  struct error *err)
 {
 	struct station *stations = stations_of(request->nominal);
 	struct stance *stances = malloc((size_t)calibration->count * sizeof(*stances));
 	struct follow *runs = malloc((size_t)calibration->count * sizeof(*runs));
-	int count = 0, code = 0;
+	int count = 0, code = 0, first;
 
 	if (stations == NULL || stances == NULL || runs == NULL)
 		code = error_set(err, ERR_NO_MEMORY, "no memory for %d views", calibration->count);
-	for (int i = 0; i < calibration->count && code == 0; i++) {
-		const int k = stations[i].view;
+	first = code == 0 ? first_station(stations, calibration->count) : 0;
+	for (int n = 0; n < calibration->count && code == 0; n++) {
+		const int i = (first + n) % calibration->count, k = stations[i].view;
 		struct calibrated_view *view = &calibration->views[k];
 		struct pose nominal;
 

@@ -554,6 +554,37 @@ START_TEST(a_view_from_another_side_of_the_phantom_is_refused)
 }
 END_TEST
 
+/* A short sweep over the angle of 180 degrees whose ends stand 15 degrees further apart than the nominal ones. */
+START_TEST(the_ends_of_a_short_sweep_follow_no_view)
+{
+	enum { VIEWS = 30 };
+	const double pixel_mm[2] = {2.47, 2.47};
+	const struct arm arm = {.columns = 147,
+				.rows = 127,
+				.count = VIEWS,
+				.pixel = 2.47,
+				.first = 2,
+				.step = 200 * M_PI / 180 / (VIEWS - 1),
+				.sag = 1,
+				.seed = 5};
+	struct geometry nominal;
+	struct calibrated_view views[VIEWS];
+	struct calibration calibration = {.count = VIEWS, .views = views};
+	const struct calibrate_request request = {.nominal = &nominal, .pixel_mm = pixel_mm};
+	struct error err = {0};
+
+	ck_assert_msg(arm_nominal_geometry(&arm, &nominal, &err) == 0, "%s", err.text);
+	for (int k = 0; k < VIEWS; k++) {
+		views[k] = (struct calibrated_view){.view = arm_view(&arm, k), .used = true};
+		look_from_elsewhere(&views[k].view, (k - VIEWS / 2) * .5 * M_PI / 180, false, 0);
+	}
+	ck_assert_msg(follow_refuse(&calibration, &request, 0, &err) == 0, "%s", err.text);
+	for (int k = 0; k < VIEWS; k++)
+		ck_assert_msg(views[k].used, "view %d: %s", k, views[k].refused);
+	geometry_clear(&nominal);
+}
+END_TEST
+
 START_TEST(a_code_that_reads_the_same_backwards_is_refused)
 {
 	/* 01101001110010110100: backwards, and 3 places on, all of it. */
@@ -838,6 +869,7 @@ Suite *calibrate_suite(void)
 	tcase_add_loop_test(tests, shadows_that_cover_each_other_are_fitted_together, 0, 8);
 	tcase_add_loop_test(tests, a_phantom_beside_its_place_is_taken_for_no_other, 0,
 			    sizeof(beside) / sizeof(*beside));
+	tcase_add_test(tests, the_ends_of_a_short_sweep_follow_no_view);
 	tcase_add_test(tests, a_view_from_another_side_of_the_phantom_is_refused);
 	tcase_add_test(tests, a_code_that_reads_the_same_backwards_is_refused);
 	tcase_add_test(tests, the_code_of_two_sizes_finds_a_phantom_however_it_is_turned);
