@@ -90,6 +90,17 @@ static int on_picture(const struct run *run, const struct pose *pose)
 	return count;
 }
 
+/* The pose of new pairs, `drop`: without those that are far off. False where there are too few. */
+static bool fit_again(const struct run *run, bool drop, struct pose *pose, struct pair *pairs, int *count)
+{
+	if (drop && *count >= PAIRS_LEAST)
+		*count = drop_outliers(run, pose, pairs, *count);
+	if (*count < PAIRS_LEAST)
+		return false;
+	pose_fit(pose, run->request->pixel_mm, &run->calibration->balls, pairs, *count);
+	return true;
+}
+
 /* Refines a view's pose step by step, with new pairs under each pose. Returns how many pairs are used. */
 static int refine(const struct run *run, int view, struct pose *pose, struct pair *pairs, int count)
 {
@@ -101,11 +112,8 @@ static int refine(const struct run *run, int view, struct pose *pose, struct pai
 	for (int i = 0; i < 3; i++) {
 		count = match_pose(&run->matches[view], pose, pixel_mm, balls, reaches[i], pairs);
 		count = drop_overlaps(run, pose, pairs, count);
-		if (i > 0 && count >= PAIRS_LEAST)
-			count = drop_outliers(run, pose, pairs, count);
-		if (count < PAIRS_LEAST)
+		if (!fit_again(run, i > 0, pose, pairs, &count))
 			return count;
-		pose_fit(pose, pixel_mm, balls, pairs, count);
 	}
 	return count;
 }
@@ -151,11 +159,8 @@ static int refine_touching(const struct run *run, int view, const float *image, 
 
 	for (int i = 0; i < ROUNDS; i++) {
 		count = touching_fit(&run->matches[view], image, pose, pixel_mm, balls, pairs);
-		if (i > 0 && count >= PAIRS_LEAST)
-			count = drop_outliers(run, pose, pairs, count);
-		if (count < PAIRS_LEAST)
+		if (!fit_again(run, i > 0, pose, pairs, &count))
 			return count;
-		pose_fit(pose, pixel_mm, balls, pairs, count);
 	}
 	return count;
 }

@@ -280,14 +280,19 @@ test_a_phantom_that_stood_turned_is_told_in_every_scan() {
 	stop_daemon
 }
 
-test_calibrations_outlive_crashes_and_damage_is_told() {
-	local file
+# Of a daemon whose calibrations take a minute to begin: $calibration.
+post_slow_calibration() {
 	printf '#!/bin/sh\n[ "$1" != --calibrate ] || exec sleep 60\nexec "%s" "$@"\n' "$BUILD/cbct-worker" >"$work/slow"
 	chmod +x "$work/slow"
 	start_daemon --worker "$work/slow"
 	balls
 	req POST /v1/calibrations "${json[@]}" "{\"scan\": \"$balls\", \"phantom\": $phantom}"
 	calibration=$(jq -r .id "$body")
+}
+
+test_calibrations_outlive_crashes_and_damage_is_told() {
+	local file
+	post_slow_calibration
 	for ((i = 0; i < 2400; i++)); do
 		req GET "/v1/calibrations/$calibration"
 		[ "$(jq -r .state "$body")" = running ] && break
@@ -363,12 +368,7 @@ test_a_result_that_is_lost_while_the_daemon_is_down_is_told() {
 
 # A failure says which file is missing, not where the daemon keeps it.
 test_a_failure_shows_no_path_of_the_server() {
-	printf '#!/bin/sh\n[ "$1" != --calibrate ] || exec sleep 60\nexec "%s" "$@"\n' "$BUILD/cbct-worker" >"$work/slow"
-	chmod +x "$work/slow"
-	start_daemon --worker "$work/slow"
-	balls
-	req POST /v1/calibrations "${json[@]}" "{\"scan\": \"$balls\", \"phantom\": $phantom}"
-	calibration=$(jq -r .id "$body")
+	post_slow_calibration
 	stop_daemon KILL
 	rm -r "$state/scans/$balls"
 	for _ in 1 2; do # as it is made, and as it is read again
