@@ -276,7 +276,9 @@ static int serve_job(struct remote *remote, const struct message *start, struct 
 	ended.code = code;
 	snprintf(ended.text, sizeof(ended.text), "%s", code == 0 ? "" : why.text);
 	code = remote_tell(remote, &ended, err);
-	tidy(remote);
+	/* A daemon that has gone knows no end: it will ask for this job again when it is back. */
+	if (code == 0)
+		tidy(remote);
 	remote_drop_checkpoint(&remote->checkpoint);
 	saver_free(remote->saver);
 	remote->saver = NULL;

@@ -5,7 +5,8 @@
  *   CALL ERRNO PART TIMES PASS
  *
  * and of the calls of CALL (fsync, fdatasync, fallocate, open, pread) on a path that has PART
- * in it, PASS succeed and the next TIMES fail with that number. The file is read at each call, so that a
+ * in it, PASS succeed and the next TIMES fail with that number. CALL may be prctl with PART parent: a process then
+ * outlives its parent. The file is read at each call, so that a
  * test may write and remove it while the programs run; the calls of all processes
  * are counted together, in the file CBCT_TEST_FAULTS.count.
  */
@@ -17,6 +18,7 @@
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
+#include <sys/prctl.h>
 #include <sys/syscall.h>
 #include <unistd.h>
 
@@ -124,4 +126,17 @@ int open(const char *path, int flags, ...)
 		mode = va_arg(args, mode_t);
 	va_end(args);
 	return fault("open", path) != 0 ? -1 : REAL(open)(path, flags, mode);
+}
+
+int prctl(int option, ...)
+{
+	unsigned long value;
+	va_list args;
+
+	va_start(args, option);
+	value = va_arg(args, unsigned long);
+	va_end(args);
+	if (option == PR_SET_PDEATHSIG && fault("prctl", "parent") != 0)
+		return -1;
+	return REAL(prctl)(option, value, 0UL, 0UL, 0UL);
 }

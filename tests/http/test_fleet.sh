@@ -111,6 +111,9 @@ test_a_zombie_is_not_heard() {
 
 test_an_owner_that_is_killed_goes_on_where_the_other_host_is() {
 	local lease=60 # longer than a daemon takes to start, on however loaded a machine
+	# Its process for the other host lives on until it sees that its daemon is gone: it ends then, and the job does not.
+	local -A within=([c]="env LD_PRELOAD=$(realpath "$BUILD")/faults.so CBCT_TEST_FAULTS=$work/faults")
+	echo 'prctl 1 parent 1000000 0' >"$work/faults"
 	begin
 	undisturbed "$scan_dir" "$long" long
 	taker a
