@@ -37,10 +37,9 @@ static int refuse_ball(struct error *err, int code, int ball, const char *fault)
 	return code;
 }
 
-/* The balls' places must reach out in three directions: a line or a plane leaves a view's matrix undetermined. */
-static int check_extent(const struct balls *balls, struct error *err)
+void balls_extent(const struct balls *balls, double ret_extent[3])
 {
-	double mean[3] = {0}, spread[3][3] = {{0}}, extent[3];
+	double mean[3] = {0}, spread[3][3] = {{0}};
 
 	for (int i = 0; i < balls->count; i++)
 		for (int a = 0; a < 3; a++)
@@ -50,16 +49,30 @@ static int check_extent(const struct balls *balls, struct error *err)
 			for (int b = 0; b < 3; b++)
 				spread[a][b] += (balls->ball[i].centre[a] - mean[a]) *
 						(balls->ball[i].centre[b] - mean[b]) / balls->count;
-	dense_eigenvalues((const double(*)[3])spread, extent);
+	dense_eigenvalues((const double(*)[3])spread, ret_extent);
 	for (int a = 0; a < 3; a++)
-		extent[a] = sqrt(fmax(0, extent[a]));
+		ret_extent[a] = sqrt(fmax(0, ret_extent[a]));
+}
+
+const char *balls_flat(const double extent[3])
+{
 	if (extent[2] >= FLATNESS_LEAST * extent[0])
+		return "";
+	return extent[1] < FLATNESS_LEAST * extent[0] ? "on a line" : "in a plane";
+}
+
+/* The balls' places must reach out in three directions: a line or a plane leaves a view's matrix undetermined. */
+static int check_extent(const struct balls *balls, struct error *err)
+{
+	double extent[3];
+
+	balls_extent(balls, extent);
+	if (balls_flat(extent)[0] == '\0')
 		return 0;
 	return error_set(err, ERR_IMPOSSIBLE,
 			 "all balls lie %s: their places spread by %.3g, %.3g and %.3g mm (RMS), expected at least "
 			 "%.3g mm in every direction",
-			 extent[1] < FLATNESS_LEAST * extent[0] ? "on a line" : "in a plane", extent[0], extent[1],
-			 extent[2], FLATNESS_LEAST * extent[0]);
+			 balls_flat(extent), extent[0], extent[1], extent[2], FLATNESS_LEAST * extent[0]);
 }
 
 static int balls_check(const struct balls *balls, struct error *err)

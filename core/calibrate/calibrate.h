@@ -13,6 +13,7 @@
  *   match.c    which shadow is of which ball: votes with the nominal geometry             (shadows -> pairs)
  *   resect.c   a view from its pairs: RANSAC over the normalised DLT                      (pairs -> a first pose)
  *   pose.c     a view's nine numbers by Levenberg-Marquardt                               (pairs -> pose)
+ *   certainty.c  what a view's shadows leave open of its pose
  *   touching.c shadows that touch, fitted together, where few stand clear          (an image, a pose -> pairs)
  *   view.c     all of these for each view
  *   bundle.c   all views and the balls' own places at once, where that is asked for

@@ -16,6 +16,12 @@ void dense_solve(const double *l, int n, double *x);
 /* Eigenvalues of a symmetric 3x3, largest first. */
 void dense_eigenvalues(const double a[3][3], double ret_values[3]);
 
+/* ---- balls.c ---- */
+/* RMS extents of the balls' places in three directions across each other, mm, the largest first. */
+void balls_extent(const struct balls *balls, double ret_extent[3]);
+/* "on a line", "in a plane" or, for extents in three directions, "". */
+const char *balls_flat(const double extent[3]);
+
 /* ---- shadows.c ---- */
 struct shadow {
 	double column, row; /* pixels: centroid of the line integrals above the background */
@@ -86,6 +92,17 @@ double pose_fit(struct pose *pose, const double pixel_mm[2], const struct balls 
 		int count);
 double pose_rms(const struct pose *pose, const double pixel_mm[2], const struct balls *balls, const struct pair *pairs,
 		int count, double *ret_worst);
+
+/* ---- certainty.c ---- */
+/* Standard deviations for a noise of one pixel in each of a shadow's coordinates; INFINITY: not determined at all. */
+struct certainty {
+	double pixels;   /* of where the view has the phantom's balls, RMS over all of them */
+	double distance; /* mm, of its source from the isocentre */
+};
+/* Pixels, of a shadow's either coordinate, that are left of `count` shadows by a pose's nine numbers with this RMS. */
+double noise_of(double rms, int count);
+struct certainty certainty_of(const struct pose *pose, const double pixel_mm[2], const struct balls *balls,
+			      const struct pair *pairs, int count);
 
 /* ---- resect.c ---- */
 /*
@@ -190,6 +207,9 @@ void pose_turn(struct pose *pose, double angle);
  * geometry, which is smooth over a sweep.
  */
 int sweep_refuse(struct calibration *calibration, const struct calibrate_request *request, struct error *err);
+/* What each view would be were it not used: between its neighbours that are; where none is, as it is. */
+int sweep_between(const struct calibration *calibration, const struct geometry *nominal, struct view *ret_views,
+		  struct error *err);
 /* Gives views that are not used the pose between their neighbours'. */
 int sweep_fill(struct calibration *calibration, const struct geometry *nominal, struct error *err);
 

@@ -18,7 +18,7 @@
 
 #include "core/calibrate/internal.h"
 
-enum { STEPS_MOST = 60 };
+enum { STEPS_MOST = 1000 }; /* balls near to a plane leave a long and winding valley to go down */
 
 static void normalise(double v[3])
 {

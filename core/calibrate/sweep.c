@@ -245,30 +245,54 @@ int sweep_refuse(struct calibration *calibration, const struct calibrate_request
 	return code;
 }
 
-int sweep_fill(struct calibration *calibration, const struct geometry *nominal, struct error *err)
+/*
+ * The view that a station would have were it not used: between its neighbours. False where no other is used. Across the
+ * opening of a short scan nothing is between: the nearer end's pose is turned on.
+ */
+static bool view_between(const struct calibration *calibration, const struct station *stations, int at,
+			 struct view *ret_view)
+{
+	const struct station *side[2];
+	double to[2];
+
+	neighbours(calibration, stations, at, side);
+	if (side[0] == NULL || side[1] == NULL)
+		return false;
+	to[0] = onward(side[0]->angle, stations[at].angle);
+	to[1] = onward(stations[at].angle, side[1]->angle);
+	if (to[0] + to[1] > GAP_MOST)
+		side[to[0] < to[1] ? 1 : 0] = side[to[0] < to[1] ? 0 : 1];
+	*ret_view = between(side[0], &calibration->views[side[0]->view].view, side[1],
+			    &calibration->views[side[1]->view].view, stations[at].angle);
+	return true;
+}
+
+int sweep_between(const struct calibration *calibration, const struct geometry *nominal, struct view *ret_views,
+		  struct error *err)
 {
 	struct station *stations = stations_of(nominal);
 
 	if (stations == NULL)
 		return error_set(err, ERR_NO_MEMORY, "no memory for %d views", calibration->count);
 	for (int i = 0; i < calibration->count; i++) {
-		struct calibrated_view *view = &calibration->views[stations[i].view];
-		const struct station *side[2];
-		double to[2];
+		struct view *view = &ret_views[stations[i].view];
 
-		if (view->used)
-			continue;
-		neighbours(calibration, stations, i, side);
-		if (side[0] == NULL || side[1] == NULL)
-			continue;
-		to[0] = onward(side[0]->angle, stations[i].angle);
-		to[1] = onward(stations[i].angle, side[1]->angle);
-		/* Across the opening of a short scan nothing is between: the nearer end's pose is turned on. */
-		if (to[0] + to[1] > GAP_MOST)
-			side[to[0] < to[1] ? 1 : 0] = side[to[0] < to[1] ? 0 : 1];
-		view->view = between(side[0], &calibration->views[side[0]->view].view, side[1],
-				     &calibration->views[side[1]->view].view, stations[i].angle);
+		if (!view_between(calibration, stations, i, view))
+			*view = calibration->views[stations[i].view].view;
 	}
 	free(stations);
 	return 0;
+}
+
+int sweep_fill(struct calibration *calibration, const struct geometry *nominal, struct error *err)
+{
+	struct view *views = malloc((size_t)calibration->count * sizeof(*views));
+	int code = views != NULL ? sweep_between(calibration, nominal, views, err)
+				 : error_set(err, ERR_NO_MEMORY, "no memory for %d views", calibration->count);
+
+	for (int k = 0; k < calibration->count && code == 0; k++)
+		if (!calibration->views[k].used)
+			calibration->views[k].view = views[k];
+	free(views);
+	return code;
 }

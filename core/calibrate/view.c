@@ -19,6 +19,9 @@ static const double UNEVEN_FACTOR = 4;   /* of the median of the views' residual
 static const double UNEVEN_LEAST = .1;   /* pixels */
 static const double NEIGHBOUR_REACH = 4; /* mm at the detector, from a pose between the neighbours' */
 static const double CLEARANCE = 2;       /* pixels between two shadows that do not touch */
+static const double SETTLED = .99;       /* of a residual, which a pose of another beginning must stay below */
+static const double OPEN_MOST = .5;      /* pixels, by which a view may leave open where the balls are */
+static const double OPEN_FACTOR = 4;     /* of the median over the views */
 
 static void refuse(struct calibrated_view *view, const char *format, ...) __attribute__((format(printf, 2, 3)));
 
@@ -236,6 +239,22 @@ static int first_pose(const struct run *run, int view, bool again, struct pair *
 	return 0;
 }
 
+/* A view has this pose of these pairs. */
+static void keep_view(const struct run *run, int view, const struct pose *pose, const struct pair *pairs, int count)
+{
+	struct calibrated_view *result = &run->calibration->views[view];
+	struct work *work = &run->works[view];
+
+	work->pose = *pose;
+	work->pair_count = count;
+	memcpy(work->pairs, pairs, (size_t)count * sizeof(*pairs));
+	measure_view(run, view);
+	result->used = true;
+	result->refused[0] = '\0';
+	if (result->rms > RMS_MOST)
+		refuse(result, "its residual is %.2f pixels, expected at most %g", result->rms, RMS_MOST);
+}
+
 static void find_view(const struct run *run, int view, double turn, bool again, struct scratch *scratch)
 {
 	struct calibrated_view *result = &run->calibration->views[view];
@@ -269,14 +288,7 @@ static void find_view(const struct run *run, int view, double turn, bool again, 
 		    used, work->count, expected, result->rms, agreeing);
 		return;
 	}
-	work->pose = pose;
-	work->pair_count = used;
-	memcpy(work->pairs, pairs, (size_t)used * sizeof(*pairs));
-	measure_view(run, view);
-	result->used = true;
-	result->refused[0] = '\0';
-	if (result->rms > RMS_MOST)
-		refuse(result, "its residual is %.2f pixels, expected at most %g", result->rms, RMS_MOST);
+	keep_view(run, view, &pose, pairs, used);
 }
 
 /*
@@ -307,8 +319,38 @@ static int refuse_uneven(const struct run *run, struct error *err)
 	return 0;
 }
 
-/* Tries all views that are not used yet. */
-static int find_round(const struct run *run, double turn, bool again, struct error *err)
+/*
+ * Few balls near to a plane have a second pose that fits them to some hundredths of a pixel, or nearly: a view begins
+ * once more from where its neighbours stand, and of both poses the one that fits its own shadows better is its own.
+ */
+static void settle_view(const struct run *run, int view, const struct view *between, struct scratch *scratch)
+{
+	const struct calibrated_view *result = &run->calibration->views[view];
+	const struct work *work = &run->works[view];
+	struct pair *pairs = scratch->pairs;
+	struct pose pose, first;
+	int used = work->pair_count;
+
+	pulse_beat();
+	pose_of_view(&pose, between);
+	if (!(pose_fit(&pose, run->request->pixel_mm, &run->calibration->balls, work->pairs, used) <
+	      SETTLED * result->rms))
+		return;
+	first = pose;
+	memcpy(pairs, work->pairs, (size_t)used * sizeof(*pairs));
+	used = refine(run, view, &pose, pairs, used);
+	if (used < CLEAR_LEAST * on_picture(run, &first))
+		used = use_touching(run, view, &first, scratch, &pose, used);
+	if (used >= PAIRS_LEAST && used >= SHARE_LEAST * on_picture(run, &pose))
+		keep_view(run, view, &pose, pairs, used);
+}
+
+/* What a round does: views that are not used begin from the nominal geometry, or from their neighbours. */
+enum round { ROUND_NOMINAL, ROUND_AGAIN, ROUND_SETTLE /* those that are used, from their neighbours */ };
+
+/* `between`: of ROUND_SETTLE, where each view's neighbours have it. */
+static int find_round(const struct run *run, double turn, enum round round, const struct view *between,
+		      struct error *err)
 {
 	int failed = 0;
 
@@ -318,9 +360,16 @@ static int find_round(const struct run *run, double turn, bool again, struct err
 		bool open = scratch_open(&scratch, run->request->nominal);
 
 #pragma omp for schedule(dynamic)
-		for (int k = 0; k < run->calibration->count; k++)
-			if (open && scratch.code == 0 && !run->calibration->views[k].used)
-				find_view(run, k, turn, again, &scratch);
+		for (int k = 0; k < run->calibration->count; k++) {
+			const bool settle = round == ROUND_SETTLE;
+
+			if (!open || scratch.code < 0 || run->calibration->views[k].used != settle)
+				continue;
+			if (settle)
+				settle_view(run, k, &between[k], &scratch);
+			else
+				find_view(run, k, turn, round == ROUND_AGAIN, &scratch);
+		}
 		if (scratch.code < 0) {
 #pragma omp critical(calibrate_failed)
 			{
@@ -334,6 +383,79 @@ static int find_round(const struct run *run, double turn, bool again, struct err
 	return failed;
 }
 
+static int settle_round(const struct run *run, struct error *err)
+{
+	const int count = run->calibration->count;
+	struct view *between = malloc((size_t)count * sizeof(*between));
+	int code = between != NULL ? sweep_between(run->calibration, run->request->nominal, between, err)
+				   : error_set(err, ERR_NO_MEMORY, "no memory for %d views", count);
+
+	if (code == 0)
+		code = find_round(run, 0, ROUND_SETTLE, between, err);
+	free(between);
+	return code;
+}
+
+/* Why a view's balls leave its pose open: those in a plane say nothing of what is off it. */
+static void refuse_open_view(const struct run *run, int view, double open, double limit)
+{
+	const struct work *work = &run->works[view];
+	struct ball own[BALLS_MOST];
+	const struct balls balls = {.count = work->pair_count, .ball = own};
+	double extent[3];
+
+	for (int i = 0; i < work->pair_count; i++)
+		own[i] = run->calibration->balls.ball[work->pairs[i].ball];
+	balls_extent(&balls, extent);
+	if (balls_flat(extent)[0] != '\0')
+		refuse(&run->calibration->views[view],
+		       "the %d balls that it shows lie nearly %s, which does not determine its pose", work->pair_count,
+		       balls_flat(extent));
+	else
+		refuse(&run->calibration->views[view],
+		       "the %d balls that it shows leave its pose open by %.1f pixels over all balls, expected at most "
+		       "%.1f",
+		       work->pair_count, open, limit);
+}
+
+/*
+ * Refuses views whose shadows do not determine their poses. The noise is that of all views' residuals: what is left of
+ * seven balls by nine numbers says little of it.
+ */
+static int refuse_open(const struct run *run, struct error *err)
+{
+	const int count = run->calibration->count;
+	float *scratch = malloc((size_t)count * sizeof(*scratch)), *open = malloc((size_t)count * sizeof(*open));
+	double noise, limit;
+	int used = 0;
+
+	if (scratch == NULL || open == NULL) {
+		free(scratch);
+		free(open);
+		return error_set(err, ERR_NO_MEMORY, "no memory for %d views", count);
+	}
+	for (int k = 0; k < count; k++)
+		if (run->calibration->views[k].used)
+			scratch[used++] = (float)noise_of(run->calibration->views[k].rms, run->works[k].pair_count);
+	noise = used > 0 ? select_kth(scratch, used, used / 2) : 0;
+	for (int k = 0, i = 0; k < count; k++)
+		if (run->calibration->views[k].used) {
+			const struct work *work = &run->works[k];
+
+			open[k] = (float)(noise * certainty_of(&work->pose, run->request->pixel_mm,
+							       &run->calibration->balls, work->pairs, work->pair_count)
+						      .pixels);
+			scratch[i++] = open[k];
+		}
+	limit = used > 0 ? fmax(OPEN_MOST, OPEN_FACTOR * select_kth(scratch, used, used / 2)) : 0;
+	for (int k = 0; k < count; k++)
+		if (run->calibration->views[k].used && !(open[k] <= limit))
+			refuse_open_view(run, k, open[k], limit);
+	free(scratch);
+	free(open);
+	return 0;
+}
+
 /*
  * The first round begins from the nominal geometry; views that it refused begin once more, from where their neighbours
  * stand.
@@ -341,18 +463,25 @@ static int find_round(const struct run *run, double turn, bool again, struct err
  */
 int find_views(struct run *run, double turn, struct error *err)
 {
-	int code = find_round(run, turn, false, err);
+	struct calibration *calibration = run->calibration;
+	int code = find_round(run, turn, ROUND_NOMINAL, NULL, err);
 
 	/* Neighbours are judged, and others begun from them, once none of them is on another side of the phantom. */
 	if (code == 0)
-		code = follow_refuse(run->calibration, run->request, turn, err);
+		code = refuse_open(run, err);
+	if (code == 0)
+		code = follow_refuse(calibration, run->request, turn, err);
 	if (code == 0)
 		code = refuse_uneven(run, err);
 	if (code == 0)
-		code = sweep_fill(run->calibration, run->request->nominal, err);
+		code = sweep_fill(calibration, run->request->nominal, err);
 	if (code == 0)
-		code = find_round(run, turn, true, err);
+		code = find_round(run, turn, ROUND_AGAIN, NULL, err);
 	if (code == 0)
-		code = follow_refuse(run->calibration, run->request, turn, err);
+		code = refuse_open(run, err);
+	if (code == 0)
+		code = follow_refuse(calibration, run->request, turn, err);
+	if (code == 0)
+		code = settle_round(run, err);
 	return code == 0 ? refuse_uneven(run, err) : code;
 }

@@ -43,43 +43,15 @@ static double between(uint64_t *state, double least, double most)
 static double reprojection(const struct arm *arm, const struct calibration *calibration, double *ret_worst)
 {
 	double squares = 0;
-	int count = 0;
 
 	*ret_worst = 0;
 	for (int k = 0; k < calibration->count; k++) {
-		const struct view truth = arm_view(arm, k);
-		double a[12], b[12], own = 0;
+		const double own = arm_wrong(arm, k, &calibration->views[k].view);
 
-		view_matrix(&truth, a);
-		view_matrix(&calibration->views[k].view, b);
-		for (int i = 0; i < 27; i++) {
-			const double point[3] = {(i % 3 - 1) * 40, (i / 3 % 3 - 1) * 40, (i / 9 - 1) * 40};
-			double pixel[4];
-
-			view_project(a, point, &pixel[0], &pixel[1]);
-			view_project(b, point, &pixel[2], &pixel[3]);
-			own += pow(pixel[0] - pixel[2], 2) + pow(pixel[1] - pixel[3], 2);
-		}
-		squares += own / 27;
-		count++;
-		*ret_worst = fmax(*ret_worst, sqrt(own / 27));
+		squares += own * own;
+		*ret_worst = fmax(*ret_worst, own);
 	}
-	return sqrt(squares / fmax(1, count));
-}
-
-static int calibrate_scene(struct scene *scene, const struct balls *drawing, struct calibration *ret, struct error *err)
-{
-	const double pixel_mm[2] = {scene->arm.pixel, scene->arm.pixel};
-	struct geometry nominal;
-	struct calibrate_request request = {
-	    .nominal = &nominal, .pixel_mm = pixel_mm, .balls = drawing, .image = take_picture, .context = scene};
-	int code = arm_nominal_geometry(&scene->arm, &nominal, err);
-
-	if (code < 0)
-		return code;
-	code = calibrate(ret, &request, err);
-	geometry_clear(&nominal);
-	return code;
+	return sqrt(squares / fmax(1, calibration->count));
 }
 
 /* A panel of 381 x 305 mm with pixels of .95 to 2.54 mm, and a phantom of 2 or 3 circles of 8 to 12 balls. */
@@ -169,7 +141,7 @@ static void try_drawing(int which, struct scene *scene, struct ball_circles circ
 	if (balls_circles(&balls, &circles, &err) < 0)
 		return;
 	tally->scenes++;
-	if (calibrate_scene(scene, &balls, &calibration, &err) < 0) {
+	if (arm_calibrate(&scene->arm, take_picture, scene, &balls, false, &calibration, &err) < 0) {
 		printf("   %-32s refused: %.200s\n", drawing->what, err.text);
 		tally->refused++;
 		balls_clear(&balls);

@@ -257,3 +257,50 @@ void arm_picture(const struct arm *arm, const struct target *target, int view, f
 		ret_picture[i] =
 		    (float)-log(fmax(.5, counts(&state, target->photons * exp(-ret_picture[i]))) / target->photons);
 }
+
+int arm_image(void *context, int view, float *ret_image, struct error *err)
+{
+	const struct arm_scene *scene = context;
+
+	(void)err;
+	arm_picture(&scene->arm, &scene->target, view, ret_image);
+	return 0;
+}
+
+int arm_calibrate(const struct arm *arm, calibrate_image *image, void *context, const struct balls *drawing,
+		  bool adjust_balls, struct calibration *ret_calibration, struct error *err)
+{
+	const double pixel_mm[2] = {arm->pixel, arm->pixel};
+	struct geometry nominal;
+	const struct calibrate_request request = {.nominal = &nominal,
+						  .pixel_mm = pixel_mm,
+						  .balls = drawing,
+						  .adjust_balls = adjust_balls,
+						  .image = image,
+						  .context = context};
+	int code = arm_nominal_geometry(arm, &nominal, err);
+
+	if (code < 0)
+		return code;
+	code = calibrate(ret_calibration, &request, err);
+	geometry_clear(&nominal);
+	return code;
+}
+
+double arm_wrong(const struct arm *arm, int view, const struct view *found)
+{
+	const struct view truth = arm_view(arm, view);
+	double a[12], b[12], squares = 0;
+
+	view_matrix(&truth, a);
+	view_matrix(found, b);
+	for (int i = 0; i < 27; i++) {
+		const double point[3] = {(i % 3 - 1) * 40, (i / 3 % 3 - 1) * 40, (i / 9 - 1) * 40};
+		double pixel[4];
+
+		view_project(a, point, &pixel[0], &pixel[1]);
+		view_project(b, point, &pixel[2], &pixel[3]);
+		squares += pow(pixel[0] - pixel[2], 2) + pow(pixel[1] - pixel[3], 2);
+	}
+	return sqrt(squares / 27);
+}

@@ -39,4 +39,16 @@ struct target {
 /* Line integrals of a view, [row][column]. */
 void arm_picture(const struct arm *arm, const struct target *target, int view, float *ret_picture);
 
+/* Pictures of a target as `calibrate` asks for them: arm_image with a struct arm_scene as its context. */
+struct arm_scene {
+	struct arm arm;
+	struct target target;
+};
+int arm_image(void *context, int view, float *ret_image, struct error *err);
+/* Calibrates an arm from such pictures, or others, and a drawing. */
+int arm_calibrate(const struct arm *arm, calibrate_image *image, void *context, const struct balls *drawing,
+		  bool adjust_balls, struct calibration *ret_calibration, struct error *err);
+/* RMS distance, pixels, between where a view and the true one see 27 points of the volume. */
+double arm_wrong(const struct arm *arm, int view, const struct view *found);
+
 #endif

@@ -20,7 +20,8 @@
 			    row(parameter) row(format) row(patient) row(subject) row(metaimage) row(rtk_geometry)      \
 				row(slice) row(sums) row(scan_directory) row(message) row(queue) row(outcome)          \
 				    row(watchdog) row(host_memory) row(route) row(lock) row(log) row(store)            \
-					row(catalogue) row(upgrade) row(ledger) row(job) row(calibrate)
+					row(catalogue) row(upgrade) row(ledger) row(job) row(calibrate)                \
+					    row(calibrate_views)
 
 /* Weak: a row may stand here before its file does. What is missing is said aloud. */
 #define DECLARE(name) Suite *name##_suite(void) __attribute__((weak));

@@ -23,37 +23,10 @@ static const struct arm arm_sagging = {.columns = 620,
 static const struct ball_circles circles = {
     .circles = 2, .balls = 12, .diameter = 110, .distance = 90, .ball = 3.2, .first = .2, .shift = .26};
 
-struct scene {
-	struct arm arm;
-	struct target target;
-};
-
-static int take_picture(void *context, int view, float *ret_image, struct error *err)
-{
-	const struct scene *scene = context;
-
-	(void)err;
-	arm_picture(&scene->arm, &scene->target, view, ret_image);
-	return 0;
-}
-
-static int run(struct scene *scene, const struct balls *balls, bool adjust, struct calibration *ret_calibration,
+static int run(struct arm_scene *scene, const struct balls *balls, bool adjust, struct calibration *ret_calibration,
 	       struct error *err)
 {
-	const double pixel_mm[2] = {scene->arm.pixel, scene->arm.pixel};
-	struct geometry nominal;
-	struct calibrate_request request = {.nominal = &nominal,
-					    .pixel_mm = pixel_mm,
-					    .balls = balls,
-					    .adjust_balls = adjust,
-					    .image = take_picture,
-					    .context = scene};
-	int code;
-
-	ck_assert_msg(arm_nominal_geometry(&scene->arm, &nominal, err) == 0, "%s", err->text);
-	code = calibrate(ret_calibration, &request, err);
-	geometry_clear(&nominal);
-	return code;
+	return arm_calibrate(&scene->arm, arm_image, scene, balls, adjust, ret_calibration, err);
 }
 
 /*
@@ -114,18 +87,8 @@ static double reprojection(const struct arm *arm, const struct calibration *cali
 	double squares = 0;
 
 	for (int k = 0; k < calibration->count; k++)
-		for (int i = 0; i < 27; i++) {
-			const double point[3] = {(i % 3 - 1) * 40, (i / 3 % 3 - 1) * 40, (i / 9 - 1) * 40};
-			const struct view truth = arm_view(arm, k);
-			double a[12], b[12], pixel[4];
-
-			view_matrix(&truth, a);
-			view_matrix(&calibration->views[k].view, b);
-			view_project(a, point, &pixel[0], &pixel[1]);
-			view_project(b, point, &pixel[2], &pixel[3]);
-			squares += pow(pixel[0] - pixel[2], 2) + pow(pixel[1] - pixel[3], 2);
-		}
-	return sqrt(squares / (27 * calibration->count));
+		squares += pow(arm_wrong(arm, k, &calibration->views[k].view), 2);
+	return sqrt(squares / calibration->count);
 }
 
 /* All views are used, and residual, poses and volume are as true as asked for. */
@@ -188,7 +151,7 @@ static const struct {
 
 START_TEST(finds_views_of_a_sagging_arm)
 {
-	struct scene scene = {.arm = arm_sagging};
+	struct arm_scene scene = {.arm = arm_sagging};
 	struct balls balls;
 	struct calibration calibration;
 	struct error err = {0};
@@ -214,7 +177,7 @@ END_TEST
 /* A phantom away from the axis: in a third of the views half of its balls are outside of the picture. */
 START_TEST(finds_views_that_see_half_of_the_balls)
 {
-	struct scene scene = {.arm = arm_sagging};
+	struct arm_scene scene = {.arm = arm_sagging};
 	struct balls balls;
 	struct calibration calibration;
 	struct error err = {0};
@@ -278,7 +241,7 @@ static const struct {
 
 START_TEST(shadows_that_touch_are_told_apart)
 {
-	struct scene scene = {.arm = arm_sagging};
+	struct arm_scene scene = {.arm = arm_sagging};
 	struct ball_circles drawn = circles;
 	struct balls balls;
 	struct calibration calibration;
@@ -338,7 +301,7 @@ static const struct {
 
 START_TEST(a_drawing_that_is_wrong_by_two_percent_is_told)
 {
-	struct scene scene = {.arm = arm_sagging};
+	struct arm_scene scene = {.arm = arm_sagging};
 	struct ball_circles is = circles, drawn;
 	struct balls balls, drawing;
 	struct calibration calibration;
@@ -450,7 +413,7 @@ static const struct {
 
 START_TEST(a_phantom_beside_its_place_is_taken_for_no_other)
 {
-	struct scene scene = {.arm = beside[_i].arm};
+	struct arm_scene scene = {.arm = beside[_i].arm};
 	struct balls drawing, standing;
 	struct calibration calibration;
 	struct error err = {0};
@@ -607,7 +570,7 @@ START_TEST(the_code_of_two_sizes_finds_a_phantom_however_it_is_turned)
 	const double turn = 100 * M_PI / 180;
 	const struct ball_helix helix = {
 	    .balls = 40, .diameter = 110, .pitch = 40, .step = .42, .ball = {3, 5}, .large = large};
-	struct scene scene = {.arm = arm_sagging};
+	struct arm_scene scene = {.arm = arm_sagging};
 	struct balls drawing, standing;
 	struct calibration calibration;
 	struct error err = {0};
@@ -639,7 +602,7 @@ END_TEST
 /* Balls up to .08 mm from their drawing: adjusted, residual and balls come nearer to the truth. */
 START_TEST(adjusting_the_balls_takes_errors_of_machining_out)
 {
-	struct scene scene = {.arm = arm_sagging};
+	struct arm_scene scene = {.arm = arm_sagging};
 	struct balls drawing, machined;
 	struct calibration plain, adjusted;
 	struct error err = {0};
@@ -718,8 +681,8 @@ static const struct {
 
 static int take_counts(void *context, int view, float *ret_image, struct error *err)
 {
-	const struct scene *scene = context;
-	const int code = take_picture(context, view, ret_image, err);
+	const struct arm_scene *scene = context;
+	const int code = arm_image(context, view, ret_image, err);
 
 	for (int i = 0; i < scene->arm.columns * scene->arm.rows; i++)
 		ret_image[i] = 60000 * expf(-ret_image[i]);
@@ -729,14 +692,14 @@ static int take_counts(void *context, int view, float *ret_image, struct error *
 START_TEST(pictures_that_do_not_fit_are_refused_with_their_numbers)
 {
 	struct ball_circles given = circles;
-	struct scene scene = {.arm = arm_sagging};
+	struct arm_scene scene = {.arm = arm_sagging};
 	struct balls balls, asked;
 	struct geometry nominal;
 	struct calibration calibration = {0};
 	struct error err = {0};
 	const double pixel_mm[2] = {arm_sagging.pixel, arm_sagging.pixel};
 	struct calibrate_request request = {
-	    .nominal = &nominal, .pixel_mm = pixel_mm, .balls = &asked, .image = take_picture, .context = &scene};
+	    .nominal = &nominal, .pixel_mm = pixel_mm, .balls = &asked, .image = arm_image, .context = &scene};
 
 	scene.arm.count = 9;
 	scene.arm.step *= 2;
@@ -786,17 +749,17 @@ END_TEST
 /* One view whose arm was pushed: it alone is refused, and gets the pose between its neighbours'. */
 static int take_pushed(void *context, int view, float *ret_image, struct error *err)
 {
-	struct scene scene = *(const struct scene *)context;
+	struct arm_scene scene = *(const struct arm_scene *)context;
 
 	if (view == 9)
 		scene.arm.first += 1.5 * M_PI / 180;
-	return take_picture(&scene, view, ret_image, err);
+	return arm_image(&scene, view, ret_image, err);
 }
 
 /* _i: whether the balls' places are adjusted, too, which the view has no part in. */
 START_TEST(a_view_that_does_not_follow_its_neighbours_is_refused)
 {
-	struct scene scene = {.arm = arm_sagging};
+	struct arm_scene scene = {.arm = arm_sagging};
 	const double pixel_mm[2] = {scene.arm.pixel, scene.arm.pixel};
 	struct balls balls;
 	struct geometry nominal;
