@@ -80,11 +80,14 @@ double averaging_variance(double pixels, double ratio, double noise, double edge
 	return averaging_part(pixels) * told * (thin + (wide - thin) * more * fmax(0, 1 - noise / NOISY));
 }
 
+double averaging_sharpness(double pixels)
+{
+	return fmin(1, fmax(0, (pixels - TOLD_FROM) / (WIDE_FROM - TOLD_FROM)));
+}
+
 double averaging_model_share(double pixels, double noise)
 {
-	const double fine = (pixels - TOLD_FROM) / (WIDE_FROM - TOLD_FROM);
-
-	return fmin(1, fmax(0, fine)) * fmin(1, fmax(0, 2 - noise / NOISY));
+	return averaging_sharpness(pixels) * fmin(1, fmax(0, 2 - noise / NOISY));
 }
 
 /* The variance of stack_average's mean: pixels at 1 .. whole on both sides, and a share of the next one. */

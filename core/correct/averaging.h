@@ -68,6 +68,8 @@ struct averaging_mean averaging_mean(const struct recipe *recipe);
  * is thinner than voxels can hold it is as wide as with finer pixels. 0: no mean.
  */
 double averaging_variance(double pixels, double ratio, double noise, double edges, double shells);
+/* How far pixels are so fine that FDK has edges as sharp as voxels can hold, 0 .. 1: nothing up to 2 pixels a voxel. */
+double averaging_sharpness(double pixels);
 /*
  * Beside the model of the exterior the mean is not of what that has in the grid. How much of that is the model's own
  * mean over voxels, 0 .. 1: nothing up to 2 pixels a voxel, nor where half of the power of second differences is noise,

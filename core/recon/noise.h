@@ -15,14 +15,15 @@ enum { NOISE_SLICES = 24 };
 /*
  * Measures the noise of a volume's middle slices. All is 0 where nothing stands out of the background.
  * mu_water in 1/mm: what is metal beside it
- * is left out. The same voxels give the same bits, for any number of threads.
+ * is left out. sharp: 0 .. 1, how far the volume has edges as sharp as voxels, so that beside metal most places may
+ * have one. The same voxels give the same bits, for any number of threads.
  */
 int noise_measure(const struct backend *backend, struct volume *volume, const struct grid *grid, double mu_water,
-		  struct volume_noise *ret_noise, struct error *err);
+		  double sharp, struct volume_noise *ret_noise, struct error *err);
 
 /* Measures the noise of slices [z][y][x] in the host's memory. */
-int noise_of_slices(const float *slices, const int size[3], double mu_water, struct volume_noise *ret_noise,
-		    struct error *err);
+int noise_of_slices(const float *slices, const int size[3], double mu_water, double sharp,
+		    struct volume_noise *ret_noise, struct error *err);
 
 enum noise_stage { NOISE_OF_FDK, NOISE_OF_SART };
 /*

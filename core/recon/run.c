@@ -116,9 +116,12 @@ static int keep(struct recon *recon, const char *name, const char *stage, struct
 /* The noise that TV is to take out: that of the FDK volume, or without FDK of the first iterate. */
 static int measure_noise(struct recon *recon, struct error *err)
 {
-	int code = noise_measure(recon->backend, recon->volume, &recon->recipe.grid, recon->recipe.mu_water,
-				 &recon->noise, err);
+	double pixels[2];
+	int code;
 
+	averaging_pixels(&recon->orbit, &recon->recipe.grid, pixels);
+	code = noise_measure(recon->backend, recon->volume, &recon->recipe.grid, recon->recipe.mu_water,
+			     averaging_sharpness(fmin(pixels[0], pixels[1])), &recon->noise, err);
 	if (code < 0)
 		return code;
 	recon->noise_measured = true;

@@ -120,7 +120,7 @@ static struct image_figures reconstruct_fdk(const struct anatomy_scan *scan, con
 	recipe.tv.on = tv;
 	must(anatomy_reconstruct(scan, backend, device, &recipe, &volume, &noise, &alpha, &err));
 	figures = anatomy_figures(scan, volume);
-	must(noise_of_slices(volume, scan->grid.size, 0.0192, ret_noise, &err));
+	must(noise_of_slices(volume, scan->grid.size, 0.0192, 0, ret_noise, &err));
 	free(volume);
 	return figures;
 }

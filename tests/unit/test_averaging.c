@@ -396,6 +396,7 @@ START_TEST(the_default_s_mean_has_the_variance_that_it_is_asked_for)
 	ck_assert_double_eq_tol(averaging_variance(2.5, 0, 0, 0, 0), .15, 1e-9);
 	ck_assert_double_eq_tol(averaging_variance(1.5, 0, 0, 0, 0), .09, 1e-9);
 	/* And what the model of the exterior has in the grid, where the mean is wide. */
+	ck_assert_double_eq(averaging_sharpness(2), 0);
 	ck_assert_double_eq(averaging_model_share(2, 0), 0);
 	ck_assert_double_eq_tol(averaging_model_share(2.1, 0), .5, 1e-9);
 	ck_assert_double_eq(averaging_model_share(2.5, .25), 1);
