@@ -294,8 +294,17 @@ static double median_unexplained(const struct agreement *agreement, int count)
 	return 0;
 }
 
-/* The mean along an axis, and what the shifts along it are of what parts of the views doubt. */
-static void summarise_axis(struct agreement *agreement, int views, int axis)
+static void find_means(struct agreement *agreement, int views)
+{
+	for (int k = 0; k < views; k++)
+		agreement->measured += agreement->views[k].measured;
+	for (int k = 0; k < views; k++)
+		for (int a = 0; a < 2 && agreement->views[k].measured; a++)
+			agreement->mean[a] += agreement->views[k].shift[a] / agreement->measured;
+}
+
+/* What the shifts along an axis are of what parts of the views doubt. */
+static void summarise_axis(struct agreement *agreement, int views, int axis, double shared)
 {
 	double squares = 0, doubts = 0;
 
@@ -304,27 +313,31 @@ static void summarise_axis(struct agreement *agreement, int views, int axis)
 
 		if (!view->measured)
 			continue;
-		agreement->mean[axis] += view->shift[axis] / agreement->measured;
-		squares += pow(view->shift[axis], 2);
+		squares += pow(view->shift[axis] - shared, 2);
 		doubts += pow(view->doubt[axis], 2);
 	}
 	if (doubts > 0)
 		agreement->firm = fmax(agreement->firm, sqrt(squares / doubts));
 }
 
+/*
+ * Views that all lie aside along the rows by the same are those of an object that stands elsewhere; along columns they
+ * are those of detectors aside, which opposite rays see better.
+ */
 static void summarise(struct agreement *agreement, const struct reduced *reduced)
 {
+	const double shared[2] = {opposite_rays_against_mean(&agreement->rays) ? agreement->mean[0] : 0,
+				  agreement->mean[1]};
 	double squares = 0, sigmas = 0;
 
 	for (int k = 0; k < reduced->geometry.count; k++) {
 		const struct view_agreement *view = &agreement->views[k];
-		const double square = pow(view->shift[0], 2) + pow(view->shift[1], 2);
+		const double square = pow(view->shift[0] - shared[0], 2) + pow(view->shift[1] - shared[1], 2);
 
 		if (!view->measured)
 			continue;
 		squares += square;
 		sigmas += pow(view->sigma[0], 2) + pow(view->sigma[1], 2);
-		agreement->measured++;
 		if (sqrt(square) > agreement->worst_mm) {
 			agreement->worst_mm = sqrt(square);
 			agreement->worst = reduced->views[k];
@@ -336,7 +349,7 @@ static void summarise(struct agreement *agreement, const struct reduced *reduced
 	agreement->sigma_mm = sqrt(sigmas / agreement->measured);
 	agreement->unexplained = median_unexplained(agreement, reduced->geometry.count);
 	for (int a = 0; a < 2; a++)
-		summarise_axis(agreement, reduced->geometry.count, a);
+		summarise_axis(agreement, reduced->geometry.count, a, shared[a]);
 }
 
 /* The rays that opposite views share, as the geometry says and as the shifts do. */
@@ -351,7 +364,8 @@ static int compare_opposite(const struct reduced *reduced, const struct orbit *o
 	for (int k = 0; k < reduced->geometry.count; k++)
 		for (int a = 0; a < 2; a++)
 			shifts[k][a] = agreement->views[k].shift[a] / orbit->pixel_at_isocentre[a];
-	code = opposite_rays_compare(reduced, orbit->frame[2], (const double(*)[2])shifts, &agreement->rays, err);
+	code = opposite_rays_compare(reduced, orbit->frame[2], (const double(*)[2])shifts,
+				     agreement->mean[0] / orbit->pixel_at_isocentre[0], &agreement->rays, err);
 	free(shifts);
 	return code;
 }
@@ -388,6 +402,8 @@ static int compare_with_volume(struct half *half, int *views, float *made, struc
 		code = predict(half, views, made, err);
 	if (code == 0)
 		code = compare_views(half, made, agreement->views, err);
+	if (code == 0)
+		find_means(agreement, reduced->geometry.count);
 	return code == 0 ? breathing_measure(reduced, made, !half->orbit.short_scan, &agreement->breathing, err) : code;
 }
 

@@ -181,7 +181,7 @@ static double least_shifted(const struct reduced *reduced, double (*matrices)[12
 	return least;
 }
 
-int opposite_rays_compare(const struct reduced *reduced, const double axis[3], const double (*shifts)[2],
+int opposite_rays_compare(const struct reduced *reduced, const double axis[3], const double (*shifts)[2], double mean,
 			  struct opposite_rays *ret_rays, struct error *err)
 {
 	const struct geometry *geometry = &reduced->geometry;
@@ -211,6 +211,8 @@ int opposite_rays_compare(const struct reduced *reduced, const double axis[3], c
 		ret_rays->empty = found.pairs > 0 && shown(reduced, found.row, found.from, found.to) < EMPTY * all;
 		compare_aside(reduced, matrices, all, ret_rays);
 		ret_rays->shifted_share = least_shifted(reduced, matrices, all, shifts);
+		found = compare(reduced, matrices, mean, NULL, NEITHER);
+		ret_rays->mean_share = share_of(&found, all);
 	}
 	free(matrices);
 	return 0;
@@ -272,4 +274,9 @@ bool opposite_rays_shifted(const struct opposite_rays *rays)
 bool opposite_rays_against_shifts(const struct opposite_rays *rays)
 {
 	return is_given_shown(rays) && rays->shifted_share > SHIFTED_LARGER * rays->share[OPPOSITE_GIVEN];
+}
+
+bool opposite_rays_against_mean(const struct opposite_rays *rays)
+{
+	return is_given_shown(rays) && rays->mean_share > SHIFTED_LARGER * rays->share[OPPOSITE_GIVEN];
 }

@@ -37,13 +37,14 @@ struct opposite_rays {
 	/* The least for detectors that all stand aside of the given geometry by the same, and bins by which they do. */
 	double least, least_share, aside;
 	double shifted_share; /* for the given geometry, each view moved by what was found for it */
+	double mean_share;    /* and all views moved by the mean of that along columns */
 };
 
 /*
  * axis: the orbit's, a unit vector. shifts: [view][2], bins along columns and rows by which a view's image lies aside,
- * or NULL. ERR_NO_MEMORY is the only error. The same bits for any number of threads.
+ * or NULL; mean: of those along columns. ERR_NO_MEMORY is the only error. The same bits for any number of threads.
  */
-int opposite_rays_compare(const struct reduced *reduced, const double axis[3], const double (*shifts)[2],
+int opposite_rays_compare(const struct reduced *reduced, const double axis[3], const double (*shifts)[2], double mean,
 			  struct opposite_rays *ret_rays, struct error *err);
 
 /* True if the other way round, or mirrored columns, explain what the given geometry does not, and nothing else does. */
@@ -58,5 +59,7 @@ bool opposite_rays_near_aside(const struct opposite_rays *rays);
 bool opposite_rays_shifted(const struct opposite_rays *rays);
 /* True if they agree worse by far: the views do not lie aside. */
 bool opposite_rays_against_shifts(const struct opposite_rays *rays);
+/* True if they agree worse by far moved by the mean: detectors do not all stand aside by it. */
+bool opposite_rays_against_mean(const struct opposite_rays *rays);
 
 #endif
