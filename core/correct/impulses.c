@@ -2,6 +2,7 @@
 #include "core/correct/impulses.h"
 
 #include <math.h>
+#include <stddef.h>
 #include <stdlib.h>
 #include <string.h>
 
@@ -142,7 +143,15 @@ static bool stand_out(const struct look *look, const float *row, unsigned char *
 	return any != 0;
 }
 
-/* Appends the impulses of a row; false where they are too many. */
+/* The most that a view's may be. */
+static int impulses_most(int columns, int rows)
+{
+	const int share = (int)((size_t)columns * (size_t)rows / IMPULSES_PIXELS);
+
+	return share > IMPULSES_FEW ? share : IMPULSES_FEW;
+}
+
+/* Appends the impulses of a row; false where they are too many. found: [impulses_most]. */
 static bool look_at_row(const struct look *look, int row, const unsigned char *marks, int *found, int *ret_count)
 {
 	for (int c = 0; c < look->columns; c++) {
@@ -154,7 +163,7 @@ static bool look_at_row(const struct look *look, int row, const unsigned char *m
 		around = look_around(line_integral, look, c, row);
 		if (!is_off(&around, own))
 			continue;
-		if (*ret_count == IMPULSES_MOST)
+		if (*ret_count == impulses_most(look->columns, look->rows))
 			return false;
 		found[(*ret_count)++] = row * look->columns + c;
 	}
@@ -189,7 +198,7 @@ int impulses_look(const struct linearise *linearise, const void *samples, const 
 {
 	const struct look look = {linearise, samples, pixels[0], pixels[1]};
 	const size_t columns = (size_t)pixels[0], rows = (size_t)pixels[1];
-	int found[IMPULSES_MOST], count = 0;
+	int *found = NULL, count = 0;
 	float *row = NULL;
 	bool *some = NULL, few = true;
 
@@ -198,9 +207,11 @@ int impulses_look(const struct linearise *linearise, const void *samples, const 
 		return 0;
 	row = malloc(columns * (sizeof(*row) + 1));
 	some = malloc(rows * sizeof(*some));
-	if (row == NULL || some == NULL || !find_rows(&look, some)) {
+	found = malloc((size_t)impulses_most(pixels[0], pixels[1]) * sizeof(*found));
+	if (row == NULL || some == NULL || found == NULL || !find_rows(&look, some)) {
 		free(row);
 		free(some);
+		free(found);
 		return error_set(err, ERR_NO_MEMORY, "no memory for the rows of %d x %d pixels", pixels[0], pixels[1]);
 	}
 	for (int r = 0; r < pixels[1] && few; r++) {
@@ -214,13 +225,16 @@ int impulses_look(const struct linearise *linearise, const void *samples, const 
 	}
 	free(row);
 	free(some);
-	if (!few || count == 0)
-		return 0;
-	ret_impulses->pixels = malloc((size_t)count * sizeof(*ret_impulses->pixels));
-	if (ret_impulses->pixels == NULL)
-		return error_set(err, ERR_NO_MEMORY, "no memory for %d samples", count);
-	memcpy(ret_impulses->pixels, found, (size_t)count * sizeof(*found));
-	ret_impulses->count = count;
+	if (few && count > 0) {
+		ret_impulses->pixels = malloc((size_t)count * sizeof(*ret_impulses->pixels));
+		if (ret_impulses->pixels == NULL) {
+			free(found);
+			return error_set(err, ERR_NO_MEMORY, "no memory for %d samples", count);
+		}
+		memcpy(ret_impulses->pixels, found, (size_t)count * sizeof(*found));
+		ret_impulses->count = count;
+	}
+	free(found);
 	return 0;
 }
 
@@ -272,6 +286,26 @@ static float spot_at(const struct picture *picture, int column, int row)
 	return select_kth(apart, outer, outer - 3) < EVEN * most ? sum : 0;
 }
 
+/* False where spot_at is below `least`, times `sign`, whatever the median around is: it is no less than the least. */
+static bool may_be_spot(const struct picture *picture, int column, int row, float sign, float least)
+{
+	const float *middle = picture->values + (ptrdiff_t)row * picture->columns + column;
+	float sum = 0, low = INFINITY;
+
+	if (column < RING || row < RING || column >= picture->columns - RING || row >= picture->rows - RING)
+		return true;
+	for (int r = -RING; r <= RING; r++)
+		for (int c = -RING; c <= RING; c++) {
+			const float value = sign * middle[(ptrdiff_t)r * picture->columns + c];
+
+			if (abs(r) < RING && abs(c) < RING)
+				sum += value;
+			else
+				low = fminf(low, value);
+		}
+	return !(sum - (NEXT + 1) * low < least);
+}
+
 /* Of one that is marked as none, too. */
 static int pixel_of(int pixel)
 {
@@ -302,7 +336,8 @@ static enum shown shows(const struct picture *picture, int column, int row, floa
 			const float value = value_in(picture, c, r);
 			const bool near = sign * (own - value) < BEYOND * sign * size;
 
-			if (isnan(value) || (!near && sign * spot_at(picture, c, r) < SPOT * sign * size))
+			if (isnan(value) || (!near && (!may_be_spot(picture, c, r, sign, SPOT * sign * size) ||
+						       sign * spot_at(picture, c, r) < SPOT * sign * size)))
 				continue;
 			if (!stands_out(picture->impulses, picture->columns, c, r, near ? 0 : 1))
 				return SHOWN;
@@ -376,32 +411,46 @@ static bool is_alone(const struct view_impulses *impulses, int columns, int at)
 	return near <= 2;
 }
 
+/* True for one that the views beside show, or that cannot be held against two of them. pictures: of the view first. */
+static bool is_of_object(const struct picture *pictures, int count, const struct view_impulses *impulses, int which)
+{
+	const int columns = pictures[0].columns, at = impulses->pixels[which];
+	const int column = at % columns, row = at / columns;
+	const float value = pictures[0].values[at], size = value - median_around(&pictures[0], column, row);
+	bool stays = count < 3 || !is_alone(impulses, columns, at);
+	int out = 0;
+
+	for (int k = 1; k < count && !stays; k++) {
+		const enum shown shown = shows(&pictures[k], column, row, value, size);
+
+		out += shown == SHOWN_OUT;
+		stays = shown == SHOWN || out == 2;
+	}
+	return stays;
+}
+
 int impulses_check(const struct mend_tools *tools, int view, struct view_impulses *impulses, struct error *err)
 {
 	const int columns = tools->geometry->columns, rows = tools->geometry->rows;
 	const struct view_impulses *own = &impulses[view];
 	float *values = malloc(3 * (size_t)columns * (size_t)rows * sizeof(*values));
 	struct picture pictures[3];
+	bool *none;
 	int count = 0, code;
 
 	if (values == NULL)
 		return error_set(err, ERR_NO_MEMORY, "no memory for three views");
 	code = take_pictures(tools, view, impulses, values, pictures, &count, err);
-	for (int i = 0; i < own->count && code == 0; i++) {
-		const int at = own->pixels[i], column = at % columns, row = at / columns;
-		const float size = values[at] - median_around(&pictures[0], column, row);
-		bool stays = count < 3 || !is_alone(own, columns, at);
-		int out = 0;
-
-		for (int k = 1; k < count && !stays; k++) {
-			const enum shown shown = shows(&pictures[k], column, row, values[at], size);
-
-			out += shown == SHOWN_OUT;
-			stays = shown == SHOWN || out == 2;
-		}
-		if (stays)
-			own->pixels[i] = ~at;
-	}
+	none = malloc((size_t)own->count * sizeof(*none));
+	if (code == 0 && none == NULL)
+		code = error_set(err, ERR_NO_MEMORY, "no memory for %d samples", own->count);
+#pragma omp parallel for schedule(dynamic)
+	for (int i = 0; i < (code == 0 ? own->count : 0); i++)
+		none[i] = is_of_object(pictures, count, own, i);
+	for (int i = 0; i < own->count && code == 0; i++)
+		if (none[i])
+			own->pixels[i] = ~own->pixels[i];
+	free(none);
 	free(values);
 	return code;
 }
@@ -420,12 +469,16 @@ int impulses_mend(const struct mend_tools *tools, int view, const struct view_im
 {
 	const struct backend *backend = tools->backend;
 	const int columns = tools->geometry->columns, rows = tools->geometry->rows;
-	float *values = malloc((size_t)columns * (size_t)rows * sizeof(*values)), right[IMPULSES_MOST];
+	float *values = malloc((size_t)columns * (size_t)rows * sizeof(*values));
+	float *right = malloc((size_t)impulses->count * sizeof(*right));
 	const struct picture own = {.values = values, .columns = columns, .rows = rows};
 	int code;
 
-	if (values == NULL)
+	if (values == NULL || right == NULL) {
+		free(values);
+		free(right);
 		return error_set(err, ERR_NO_MEMORY, "no memory for a view");
+	}
 	code = backend->stack_download(tools->projections, view, 1, values, err);
 	for (int i = 0; i < impulses->count && code == 0; i++)
 		right[i] = median_around(&own, impulses->pixels[i] % columns, impulses->pixels[i] / columns);
@@ -433,6 +486,7 @@ int impulses_mend(const struct mend_tools *tools, int view, const struct view_im
 		values[impulses->pixels[i]] = right[i];
 	if (code == 0)
 		code = backend->stack_upload(tools->projections, view, 1, values, err);
+	free(right);
 	free(values);
 	return code;
 }

@@ -11,7 +11,8 @@
  * is off all around it by .7 of a line integral at least, and by six times what its neighbours differ by. A bead of a
  * pixel's size looks the same in one view; it is near by in the views beside as well, and an impulse is not.
  */
-enum { IMPULSES_MOST = 256 }; /* of a view; where there are more, they are none */
+/* Where there are more of a view than IMPULSES_FEW, and than one in so many of its pixels, they are none. */
+enum { IMPULSES_FEW = 256, IMPULSES_PIXELS = 100 };
 
 struct view_impulses {
 	int count;

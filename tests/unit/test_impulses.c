@@ -95,6 +95,39 @@ START_TEST(single_samples_that_are_wrong_are_replaced)
 }
 END_TEST
 
+/* A share of all samples at random: of a large detector these are many in each view. */
+START_TEST(a_share_of_a_large_detector_is_replaced)
+{
+	enum { WIDE = 200, HIGH = 160, MANY = 24 };
+	static const struct orbit_spec spec = {WIDE, HIGH, MANY, {600, 1100, {1.1, .9}, {0, 0}, {0, 0}}, 0, 2};
+	const struct ellipsoid body = {
+	    .shape = SHAPE_ELLIPSOID, .semi_axes = {50, 44, 34}, .centre = {2, -3, 1}, .density = 0.02};
+	const struct phantom phantom = {.count = 1, .parts = (struct ellipsoid *)&body};
+	const struct grid grid = grid_of(16, 16, 8, 7, 7, 7);
+	struct recipe recipe = recipe_on(&grid);
+	float *samples = malloc(sizeof(*samples) * WIDE * HIGH * MANY);
+	struct outcome outcome = {.linearise = {.sample = SAMPLE_FLOAT32, .quantity = QUANTITY_INTENSITY, .air = FLAT},
+				  .samples = samples,
+				  .threads = 1};
+	struct scene scene;
+
+	ck_assert_ptr_nonnull(samples);
+	recipe.fdk.on = true;
+	recipe.algorithm = &algorithm_sart;
+	recipe.iterate.iterations = 1;
+	scene_orbit(&scene, &spec);
+	scene_add(&scene, &phantom);
+	random_state = 11;
+	for (int i = 0; i < WIDE * HIGH * MANY; i++)
+		samples[i] = (float)(FLAT * (uniform() < .0085 ? .003 : exp(-(double)scene.projections[i])));
+	run(&scene, &recipe, &outcome);
+	ck_assert_msg(strstr(outcome.warnings, "unlike all around them") != NULL, "%s", outcome.warnings);
+	outcome_clear(&outcome);
+	scene_clear(&scene);
+	free(samples);
+}
+END_TEST
+
 Suite *impulses_suite(void)
 {
 	Suite *suite = suite_create("impulses");
@@ -102,6 +135,7 @@ Suite *impulses_suite(void)
 
 	tcase_set_timeout(tests, 60);
 	tcase_add_loop_test(tests, single_samples_that_are_wrong_are_replaced, 0, ROWS_OF_TEST);
+	tcase_add_test(tests, a_share_of_a_large_detector_is_replaced);
 	suite_add_tcase(suite, tests);
 	return suite;
 }
