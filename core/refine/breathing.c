@@ -15,6 +15,8 @@ static const double KNOWN_LEAST = 0.95; /* of the views */
 static const double NOISE_FROM = 0.6;
 /* From where on it is told (tests/bench/results/refine.txt). */
 static const double SHARE = 0.002, TIMES = 1.7, BEYOND_NOISE = 2.5;
+/* Of what even and odd columns of a row tell apart: slender bodies at rest reach .2, what breathes 1.5 and more. */
+static const double BY_BINS = 0.5;
 /* Where only the whole has such a hill. SAME: times in the sweep. */
 static const double UNEVEN_SHARE = 0.0005, UNEVEN_PART = 0.05, UNEVEN_TIMES = 1.3, UNEVEN_BEYOND_NOISE = 1.5,
 		    SAME = 1.5;
@@ -23,6 +25,8 @@ static const double UNEVEN_SHARE = 0.0005, UNEVEN_PART = 0.05, UNEVEN_TIMES = 1.
 struct sums {
 	int views, rows;
 	double *of_rows; /* what is left, owned */
+	/* By how much the even columns exceed the odd ones, of what is measured; owned. */
+	double *by_bins;
 	/* [EXPLAINED][row], what a constant, a shift along rows and a stretch of them add, orthonormal; owned */
 	double *explained;
 };
@@ -30,17 +34,23 @@ struct sums {
 static void sums_clear(struct sums *sums)
 {
 	free(sums->of_rows);
+	free(sums->by_bins);
 	free(sums->explained);
 }
 
-/* The taper along columns takes what enters and leaves the field of view out gently. */
-static double row_sum(const float *row, int columns)
+/*
+ * The taper along columns takes what enters and leaves the field of view out gently. ret_by_bins: even columns less odd
+ * ones; NULL is fine.
+ */
+static double row_sum(const float *row, int columns, double *ret_by_bins)
 {
-	double sum = 0;
+	double sums[2] = {0};
 
 	for (int c = 0; c < columns; c++)
-		sum += pow(sin(PI * (c + 0.5) / columns), 2) * (double)row[c];
-	return sum;
+		sums[c % 2] += pow(sin(PI * (c + 0.5) / columns), 2) * (double)row[c];
+	if (ret_by_bins != NULL)
+		*ret_by_bins = sums[0] - sums[1];
+	return sums[0] + sums[1];
 }
 
 /* Binomial, along rows. */
@@ -57,7 +67,7 @@ static void smooth(double *row, int count)
 }
 
 /* What a view that is not known would show lies between those beside it, or is that of the one. */
-static void fill_in(struct sums *sums, const bool *known)
+static void fill_in(const struct sums *sums, double *values, const bool *known)
 {
 	for (int k = 0, last = -1, next; k < sums->views; k++) {
 		if (known[k]) {
@@ -67,11 +77,11 @@ static void fill_in(struct sums *sums, const bool *known)
 		for (next = k; next < sums->views && !known[next]; next++)
 			;
 		for (int r = 0; r < sums->rows; r++) {
-			const double before = sums->of_rows[(last >= 0 ? last : next) * sums->rows + r];
-			const double behind = sums->of_rows[(next < sums->views ? next : last) * sums->rows + r];
+			const double before = values[(last >= 0 ? last : next) * sums->rows + r];
+			const double behind = values[(next < sums->views ? next : last) * sums->rows + r];
 			const double share = last < 0 || next == sums->views ? 0 : (double)(k - last) / (next - last);
 
-			sums->of_rows[k * sums->rows + r] = (1 - share) * before + share * behind;
+			values[k * sums->rows + r] = (1 - share) * before + share * behind;
 		}
 	}
 }
@@ -84,16 +94,19 @@ static void add_up(const struct reduced *reduced, const float *made, double *sho
 
 	for (int k = 0; k < sums->views; k++) {
 		double *of_view = sums->of_rows + (size_t)k * (size_t)rows;
+		double *by_bins = sums->by_bins + (size_t)k * (size_t)rows;
 
 		for (int r = 0; r < rows && reduced->known[k]; r++) {
 			const size_t at = ((size_t)k * (size_t)rows + (size_t)r) * (size_t)columns;
-			const double all = row_sum(reduced->projections + at, columns);
+			const double all = row_sum(reduced->projections + at, columns, &by_bins[r]);
 
-			of_view[r] = all - row_sum(made + at, columns);
+			of_view[r] = all - row_sum(made + at, columns, NULL);
 			shown[r] += all;
 		}
-		for (int i = 0; i < SMOOTHINGS && reduced->known[k]; i++)
+		for (int i = 0; i < SMOOTHINGS && reduced->known[k]; i++) {
 			smooth(of_view, rows);
+			smooth(by_bins, rows);
+		}
 		known += reduced->known[k];
 	}
 	for (int i = 0; i < SMOOTHINGS; i++)
@@ -149,8 +162,10 @@ static void normalise(struct sums *sums, const double *shown)
 	make_orthonormal(sums->explained, EXPLAINED, stay);
 	for (int k = 0, to = 0; k < sums->views; k++)
 		for (int r = EDGE; r < rows - EDGE; r++)
-			if (shown[r] > SHOWN * most)
+			if (shown[r] > SHOWN * most) {
+				sums->by_bins[to] = sums->by_bins[k * rows + r] / shown[r];
 				sums->of_rows[to++] = sums->of_rows[k * rows + r] / shown[r];
+			}
 	sums->rows = stay;
 }
 
@@ -161,15 +176,17 @@ static int sums_open(struct sums *ret_sums, const struct reduced *reduced, const
 	struct sums sums = {.views = reduced->geometry.count,
 			    .rows = reduced->geometry.rows,
 			    .of_rows = calloc(views * rows, sizeof(double)),
+			    .by_bins = calloc(views * rows, sizeof(double)),
 			    .explained = calloc(EXPLAINED * rows, sizeof(double))};
 	int code = 0;
 
-	if (shown == NULL || sums.of_rows == NULL || sums.explained == NULL) {
+	if (shown == NULL || sums.of_rows == NULL || sums.by_bins == NULL || sums.explained == NULL) {
 		code = error_set(err, ERR_NO_MEMORY, "no memory for the rows of %zu views", views);
 		sums_clear(&sums);
 	} else {
 		add_up(reduced, made, shown, &sums);
-		fill_in(&sums, reduced->known);
+		fill_in(&sums, sums.of_rows, reduced->known);
+		fill_in(&sums, sums.by_bins, reduced->known);
 		normalise(&sums, shown);
 		*ret_sums = sums;
 	}
@@ -217,7 +234,7 @@ static void open_ends(struct sums *sums, double *polynomials)
 
 /* The mean square over the rows of what comes and goes `times` in the sweep. cosine, sine: [view], of once in the
  * sweep. */
-static double power(const struct sums *sums, int times, const double *cosine, const double *sine)
+static double power(const struct sums *sums, const double *values, int times, const double *cosine, const double *sine)
 {
 	const int views = sums->views;
 	double sum = 0;
@@ -228,8 +245,8 @@ static double power(const struct sums *sums, int times, const double *cosine, co
 		for (int k = 0; k < views; k++) {
 			const int at = times * k % views;
 
-			real += sums->of_rows[k * sums->rows + r] * cosine[at];
-			imaginary += sums->of_rows[k * sums->rows + r] * sine[at];
+			real += values[k * sums->rows + r] * cosine[at];
+			imaginary += values[k * sums->rows + r] * sine[at];
 		}
 		sum += 2 * (real * real + imaginary * imaginary) / ((double)views * views);
 	}
@@ -274,8 +291,19 @@ static struct hill highest_hill(const double *powers, int views, double about, d
 	return hill;
 }
 
+/* What all frequencies that are none of noise have beyond it, of powers that order_noise has seen. */
+static double all_beyond_noise(const double *powers, int views)
+{
+	const int from = (int)(NOISE_FROM * (views / 2 + 1)), noises = views / 2 + 1 - from;
+	double sum = 0;
+
+	for (int h = 1; h < from; h++)
+		sum += powers[h] - powers[from + noises / 2];
+	return sqrt(fmax(0, sum));
+}
+
 /* work: [4 views]; its second half gets the powers. */
-static double *find_powers(const struct sums *sums, double *work)
+static double *find_powers(const struct sums *sums, const double *values, double *work)
 {
 	double *cosine = work, *sine = work + sums->views, *powers = work + 2 * (size_t)sums->views;
 
@@ -284,20 +312,22 @@ static double *find_powers(const struct sums *sums, double *work)
 		sine[k] = sin(2 * PI * k / sums->views);
 	}
 	for (int h = 0; h <= sums->views / 2; h++)
-		powers[h] = power(sums, h, cosine, sine);
+		powers[h] = power(sums, values, h, cosine, sine);
 	order_noise(powers, sums->views);
 	return powers;
 }
 
 static void find_hills(struct sums *sums, double *work, struct breathing *ret_breathing)
 {
-	const double *powers = find_powers(sums, work);
+	const double *powers = find_powers(sums, sums->by_bins, work);
 
 	ret_breathing->measured = true;
+	ret_breathing->by_bins = all_beyond_noise(powers, sums->views);
+	powers = find_powers(sums, sums->of_rows, work);
 	ret_breathing->all = highest_hill(powers, sums->views, 0, INFINITY);
 	for (int k = 0; k < sums->views; k++)
 		take_off(sums->of_rows + (size_t)k * (size_t)sums->rows, 1, sums->explained, EXPLAINED, sums->rows);
-	powers = find_powers(sums, work);
+	powers = find_powers(sums, sums->of_rows, work);
 	ret_breathing->uneven = highest_hill(powers, sums->views, 0, INFINITY);
 	ret_breathing->there = highest_hill(powers, sums->views, ret_breathing->all.times_in_sweep, SAME);
 }
@@ -306,7 +336,7 @@ size_t breathing_bytes(const struct reduced *reduced)
 {
 	const size_t views = (size_t)reduced->geometry.count, rows = (size_t)reduced->geometry.rows;
 
-	return ((views + 1 + EXPLAINED) * rows + DRIFT * views) * sizeof(double);
+	return ((2 * views + 1 + EXPLAINED) * rows + DRIFT * views) * sizeof(double);
 }
 
 int breathing_measure(const struct reduced *reduced, const float *made, bool is_turn, struct breathing *ret_breathing,
@@ -334,9 +364,10 @@ int breathing_measure(const struct reduced *reduced, const float *made, bool is_
 	return code;
 }
 
-static bool is_hill(const struct hill *hill)
+static bool is_hill(const struct breathing *breathing, const struct hill *hill)
 {
-	return hill->share > SHARE && hill->times > TIMES && hill->share > BEYOND_NOISE * hill->noise;
+	return hill->share > fmax(SHARE, BY_BINS * breathing->by_bins) && hill->times > TIMES &&
+	       hill->share > BEYOND_NOISE * hill->noise;
 }
 
 /* True if the whole's hill stands on more than constants, shifts and stretches of the rows. */
@@ -350,5 +381,6 @@ static bool is_of_a_body(const struct breathing *breathing)
 
 bool breathing_is_told(const struct breathing *breathing)
 {
-	return is_hill(&breathing->uneven) || (is_hill(&breathing->all) && is_of_a_body(breathing));
+	return is_hill(breathing, &breathing->uneven) ||
+	       (is_hill(breathing, &breathing->all) && is_of_a_body(breathing));
 }

@@ -17,6 +17,10 @@
  * A tube whose output goes up and down makes such a hill as well, and so does an arm that swings along the rows. One
  * adds the same to all bins, the other moves all rows: what neither explains must have the hill, too.
  *
+ * What a row shows of a body that is a few bins wide changes with where its edges lie within the bins, which comes and
+ * goes as it moves across them. Half of the columns have no other sum of a wide body, and another one of such a slender
+ * one: a hill must be no less than a part of that.
+ *
  * Fewer breaths than BREATHING_LEAST in the sweep are where bodies at rest have most, and are not seen.
  */
 enum { BREATHING_LEAST = 5, BREATHING_MOST = 20 };
@@ -31,6 +35,7 @@ struct hill {
 
 struct breathing {
 	bool measured;
+	double by_bins; /* what the even columns of a row show more than the odd ones, a share, root mean square */
 	struct hill all;
 	struct hill uneven; /* without what a constant, a shift and a stretch of the rows of each view explain, */
 	struct hill there;  /* and of that the one at the frequency of the first, or next to it */
