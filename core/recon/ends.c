@@ -14,6 +14,8 @@ static const double LITTLE = 0.04, MUCH = 0.15;
 /* Voxels of the body that a slice must have for its means to say something, and at the face for an end to be looked at.
  */
 enum { BODY_LEAST = 16, BODY_AT_FACE = 4 };
+/* M is over so many times the reach to either side. */
+enum { WIDE = 4 };
 
 struct ends {
 	int columns, rows, slices; /* of the volume: x, y, z */
@@ -32,8 +34,9 @@ struct ends {
 	/* Slices of the end at work. */
 	float *values;    /* [zone] slices: V, then V' */
 	float *smooth;    /* [zone] slices: D */
+	float *wide;      /* [zone] slices: means of d over the body around */
 	float *alternate; /* [inner] slices: a */
-	float *work;      /* a slice */
+	float *work;      /* [2] slices */
 };
 
 /* ---- life ---- */
@@ -55,12 +58,12 @@ static int inner_of(const struct grid *grid, const struct geometry *geometry, in
 	return part < DEEP * reach ? part : DEEP * reach;
 }
 
-/* Counts the slices of start, held, values, smooth, alternate and work. */
+/* Counts the slices of start, held, values, smooth, wide, alternate and work. */
 static size_t slices_held(int inner, int reach)
 {
 	const size_t zone = (size_t)inner + (size_t)reach;
 
-	return ENDS * zone + ENDS * (size_t)inner + zone + zone + (size_t)inner + 1;
+	return ENDS * zone + ENDS * (size_t)inner + 3 * zone + (size_t)inner + 2;
 }
 
 size_t ends_bytes(const struct grid *grid, const struct geometry *geometry, const struct orbit *orbit)
@@ -102,7 +105,8 @@ int ends_new(const struct grid *grid, const struct geometry *geometry, const str
 	ends->held = ends->start + (size_t)(ENDS * zone) * ends->pixels;
 	ends->values = ends->held + (size_t)(ENDS * inner) * ends->pixels;
 	ends->smooth = ends->values + (size_t)zone * ends->pixels;
-	ends->alternate = ends->smooth + (size_t)zone * ends->pixels;
+	ends->wide = ends->smooth + (size_t)zone * ends->pixels;
+	ends->alternate = ends->wide + (size_t)zone * ends->pixels;
 	ends->work = ends->alternate + (size_t)inner * ends->pixels;
 	*ret_ends = ends;
 	return 0;
@@ -226,24 +230,83 @@ static void smooth_slice(struct ends *ends, const float *start, const float *val
 		}
 }
 
-/* a of one slice, before the largest nearby is taken. */
-static void alternate_slice(const struct ends *ends, int slice, float *ret_alternate)
+static bool is_body(const struct ends *ends, float start, float value)
 {
-	const float *here = ends->smooth + (size_t)slice * ends->pixels;
+	return fmax((double)start, (double)value) > 0.5 * ends->level;
+}
+
+/* Means of d over the voxels of the body around; 0 where they are too few to say something. */
+static void widen_slice(struct ends *ends, const float *start, const float *values, float *ret_wide)
+{
+	const int columns = ends->columns, rows = ends->rows, far = WIDE * ends->reach;
+	float *sums = ends->work, *counts = ends->work + ends->pixels;
 
 #pragma omp parallel for schedule(static)
-	for (size_t i = 0; i < ends->pixels; i++) {
-		float most = 0;
+	for (int y = 0; y < rows; y++)
+		for (int x = 0; x < columns; x++) {
+			const size_t row = (size_t)y * (size_t)columns;
+			const int last = x + far < columns ? x + far : columns - 1;
+			float sum = 0, count = 0;
 
-		for (int k = -ends->reach; k <= ends->reach; k++) {
-			const float there =
-			    slice + k >= 0 ? ends->smooth[(size_t)(slice + k) * ends->pixels + i] : here[i];
+			for (int i = x > far ? x - far : 0; i <= last; i++) {
+				const size_t at = row + (size_t)i;
 
-			if (here[i] * there < 0)
-				most = fmaxf(most, fminf(fabsf(here[i]), fabsf(there)));
+				if (is_body(ends, start[at], values[at])) {
+					sum += values[at] - start[at];
+					count++;
+				}
+			}
+			sums[row + (size_t)x] = sum;
+			counts[row + (size_t)x] = count;
 		}
-		ret_alternate[i] = most;
+#pragma omp parallel for schedule(static)
+	for (int y = 0; y < rows; y++)
+		for (int x = 0; x < columns; x++) {
+			const int last = y + far < rows ? y + far : rows - 1;
+			float sum = 0, count = 0;
+
+			for (int i = y > far ? y - far : 0; i <= last; i++) {
+				sum += sums[(size_t)i * (size_t)columns + (size_t)x];
+				count += counts[(size_t)i * (size_t)columns + (size_t)x];
+			}
+			ret_wide[(size_t)y * (size_t)columns + (size_t)x] = count >= BODY_LEAST ? sum / count : 0;
+		}
+}
+
+/* a of a voxel of these slices, before the largest nearby is taken. */
+static float alternates(const struct ends *ends, const float *slices, int slice, size_t i)
+{
+	const float here = slices[(size_t)slice * ends->pixels + i];
+	float most = 0;
+
+	for (int k = -ends->reach; k <= ends->reach; k++) {
+		const float there = slice + k >= 0 ? slices[(size_t)(slice + k) * ends->pixels + i] : here;
+
+		if (here * there < 0)
+			most = fmaxf(most, fminf(fabsf(here), fabsf(there)));
 	}
+	return most;
+}
+
+static void alternate_slice(const struct ends *ends, int slice, float *ret_alternate)
+{
+#pragma omp parallel for schedule(static)
+	for (size_t i = 0; i < ends->pixels; i++)
+		ret_alternate[i] = alternates(ends, ends->smooth, slice, i);
+}
+
+/* Weighted along z by (n + 1 - |k|) / (n + 1)^2; beyond the face it goes on as there. */
+static double along_axis(const struct ends *ends, const float *slices, int slice, size_t i)
+{
+	const int n = ends->reach, whole = (n + 1) * (n + 1);
+	double sum = 0;
+
+	for (int k = -n; k <= n; k++) {
+		const int there = slice + k < 0 ? 0 : slice + k;
+
+		sum += (double)(n + 1 - abs(k)) / whole * (double)slices[(size_t)there * ends->pixels + i];
+	}
+	return sum;
 }
 
 /* The largest within 2n voxels along x and y, in place. */
@@ -271,11 +334,6 @@ static void spread_slice(struct ends *ends, float *alternate)
 				    fmaxf(most, ends->work[(size_t)clamp(y + k, rows) * (size_t)columns + (size_t)x]);
 			alternate[(size_t)y * (size_t)columns + (size_t)x] = most;
 		}
-}
-
-static bool is_body(const struct ends *ends, float start, float value)
-{
-	return fmax((double)start, (double)value) > 0.5 * ends->level;
 }
 
 /* True if the body comes as near to the face as the reach. The iterate tells: FDK blurs a body's end across slices. */
@@ -312,26 +370,29 @@ static double median_in_body(const struct ends *ends, const float *start, const 
 	return bin * ends->level / BINS;
 }
 
+/* g of ends.h. */
+static double gain(const struct ends *ends, double a)
+{
+	const double much = MUCH * ends->level;
+
+	return 1 / (1 + a * a / (much * much));
+}
+
 /* V' of one slice. */
 static void blend_slice(const struct ends *ends, int slice, double doubt, const float *start, float *values)
 {
-	const int n = ends->reach, whole = (n + 1) * (n + 1);
-	const double much = MUCH * ends->level;
-
 #pragma omp parallel for schedule(static)
 	for (size_t i = 0; i < ends->pixels; i++) {
 		const double a = (double)ends->alternate[(size_t)slice * ends->pixels + i];
 		const double e = fmax(a - doubt / 2, 0), w = e * e / (e * e + doubt * doubt / 4);
-		double s = 0, wanted;
+		double mean = 0, wanted;
 
 		if (e == 0)
 			continue;
-		for (int k = -n; k <= n; k++) {
-			const int there = slice + k < 0 ? 0 : slice + k;
-
-			s += (double)(n + 1 - abs(k)) / whole * (double)ends->smooth[(size_t)there * ends->pixels + i];
-		}
-		wanted = (double)start[i] + s / (1 + a * a / (much * much));
+		if (is_body(ends, start[i], values[i]))
+			mean = gain(ends, 2 * (double)alternates(ends, ends->wide, slice, i)) *
+			       along_axis(ends, ends->wide, slice, i);
+		wanted = (double)start[i] + mean + gain(ends, a) * (along_axis(ends, ends->smooth, slice, i) - mean);
 		if (ends->nonnegative && wanted < 0)
 			wanted = 0;
 		values[i] = (float)((double)values[i] + w * (wanted - (double)values[i]));
@@ -420,6 +481,7 @@ static void blend_end(struct ends *ends, int end)
 		const size_t at = (size_t)i * ends->pixels;
 
 		smooth_slice(ends, start + at, ends->values + at, ends->smooth + at);
+		widen_slice(ends, start + at, ends->values + at, ends->wide + at);
 	}
 	for (int i = 0; i < ends->inner; i++)
 		alternate_slice(ends, i, ends->alternate + (size_t)i * ends->pixels);

@@ -19,8 +19,12 @@
  *   D = mean of d over (2n + 1)^2 voxels of the slice
  *   a = max over slices up to n away, of min(|D|, |D there|) where the signs differ, else 0;
  *       then the largest within 2n voxels of the slice
- *   V' = V + w (B + g S - V),  S = D weighted along z by (n + 1 - |k|) / (n + 1)^2
- *   w = e^2 / (e^2 + T^2 / 4), e = max(a - T / 2, 0);  g = 1 / (1 + (a / 150 HU)^2)
+ *   V' = V + w (B + M + g(a) (S - M) - V),  S = D weighted along z by (n + 1 - |k|) / (n + 1)^2
+ *   w = e^2 / (e^2 + T^2 / 4), e = max(a - T / 2, 0);  g(a) = 1 / (1 + (a / 150 HU)^2)
+ *   M = g(2 a') S', S' and a' as S and a in the voxel, of means of d over the body within 4n voxels; 0 outside of it
+ *
+ * Where a shell of bone ends the overshoot is to either side within a slice as well, and cancels in means over much of
+ * the body: M is what FDK lacks there. Where such means alternate, too, they say little.
  *
  * T is 40 HU and twice the median of a in the innermost of these slices, so that
  * noise changes nothing. Where iterations bring all slices to one side of B, as at a

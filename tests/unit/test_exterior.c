@@ -858,6 +858,43 @@ START_TEST(the_end_slices_are_no_worse_than_those_of_fdk_where_a_body_ends)
 }
 END_TEST
 
+static const struct {
+	double beyond; /* mm, as above */
+	int rays;      /* of a pixel, along each of its sides */
+} skulls[] = {{2, 1}, {2, 3}, {3, 3}};
+
+/*
+ * A skull that ends beyond the grid: the iterate's slices are wrong from place to place and right in the mean, FDK's
+ * are 110 to 190 HU too low in the mean, and the volumes that are kept were 82 to 164.
+ */
+START_TEST(the_last_slices_of_a_skull_have_the_mean_that_the_iterate_has)
+{
+	const int rays = skulls[_i].rays;
+	const double pixel = 4. / rays;
+	const struct orbit_spec spec = {72 * rays, 56 * rays, 36, {620, 1100, {pixel, pixel}, {0, 0}, {0, 0}}, 0, 10};
+	struct ellipsoid parts[2];
+	const struct phantom phantom = body_of(SKULL, 54 + skulls[_i].beyond, parts);
+	struct grid grid = grid_of(56, 56, 36, 3, 3, 3);
+	float *truth = malloc(sizeof(float) * grid_voxels(&grid));
+	struct recipe recipe = sart_on(&grid);
+	struct outcome outcome = {0};
+	struct scene scene;
+	double worst;
+
+	ck_assert_ptr_nonnull(truth);
+	scene_orbit(&scene, &spec);
+	scene_add(&scene, &phantom);
+	phantom_voxelise(&phantom, &grid, 3, truth);
+	recipe.binning = rays;
+	run(&scene, &recipe, &outcome);
+	worst = slice_errors(&scene.geometry, &grid, outcome_volume(&outcome, "final"), truth).any;
+	ck_assert_msg(worst < 100, "%.0f HU", worst);
+	outcome_clear(&outcome);
+	scene_clear(&scene);
+	free(truth);
+}
+END_TEST
+
 /* A rod that goes on far beyond both faces, beside a plate that ends well within: FDK blurs their outlines in all
  * slices. */
 START_TEST(a_rod_that_goes_on_ends_in_no_slice)
@@ -947,6 +984,7 @@ Suite *exterior_suite(void)
 	tcase_add_loop_test(truncated, a_body_that_is_spread_beyond_the_field_of_view_is_told, 0, 6);
 	suite_add_tcase(suite, truncated);
 	tcase_add_loop_test(last, the_end_slices_are_no_worse_than_those_of_fdk_where_a_body_ends, 0, COUNT(ended));
+	tcase_add_loop_test(last, the_last_slices_of_a_skull_have_the_mean_that_the_iterate_has, 0, COUNT(skulls));
 	tcase_add_test(last, a_rod_that_goes_on_ends_in_no_slice);
 	tcase_add_loop_test(last, the_end_slices_are_the_same_bits_with_other_threads_and_after_a_yield, 0, 2);
 	suite_add_tcase(suite, last);
