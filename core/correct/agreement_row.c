@@ -164,6 +164,21 @@ static void tell_breathing(const struct correction_job *job, const struct agreem
 	    hill->times_in_sweep, 100 * hill->share, hill->times, hill->share / hill->noise);
 }
 
+/* Where air is seen the level there says it (input_rows.c). */
+static void tell_drift(const struct correction_job *job, const struct opposite_rays *rays)
+{
+	if (job->input->off > 0 || !opposite_rays_drift(rays))
+		return;
+	warning_tell(
+	    job->warnings, "air_level",
+	    "line integrals of the %d rays that two views share differ by %.2g (root mean square), and by %.2g "
+	    "if the tube's output %s by %.0f %% from the first projection to the last. Nothing of that is taken "
+	    "out; an air_region makes up for it where air is seen",
+	    rays->pairs[OPPOSITE_GIVEN], sqrt(rays->square[OPPOSITE_GIVEN]),
+	    sqrt(rays->square[OPPOSITE_GIVEN] * rays->drift_share / rays->share[OPPOSITE_GIVEN]),
+	    rays->drift > 0 ? "falls" : "rises", 100 * fabs(exp(-rays->drift) - 1));
+}
+
 static int warn(const struct correction_job *job, void *opaque, struct error *err)
 {
 	struct state *state = opaque;
@@ -181,6 +196,7 @@ static int warn(const struct correction_job *job, void *opaque, struct error *er
 	if (code < 0)
 		return code;
 	tell(job, &agreement, reduced_bin(&state->reduced, job->orbit));
+	tell_drift(job, &agreement.rays);
 	tell_breathing(job, &agreement, reduced_bin(&state->reduced, job->orbit));
 	if (agreement_is_known(&agreement)) {
 		job->agreement->mm = agreement.mm;

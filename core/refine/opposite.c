@@ -21,6 +21,11 @@ static const double NEAR_SMALLER = 3, SHIFTED_SMALLER = 1.25, NEITHER[2] = {0};
  * edges (two of twelve such scans: 1.7 and 1.9); where views do lie aside it was 1.5 at most.
  */
 static const double SHIFTED_LARGER = 2;
+/*
+ * Line integrals by which a tube's output drifts at least; times by which what is left of the differences is smaller:
+ * 15 and more without much noise, 1.7 at most of departures of the geometry.
+ */
+static const double DRIFT_LEAST = 0.05, DRIFT_SMALLER = 2.5;
 /* The share of the integrals below which differences come from the bins' width, and say nothing. */
 static const double SHARE_LEAST = 0.005;
 /* Differences of integrals that have nothing to do with each other are twice their mean square. */
@@ -85,6 +90,7 @@ struct comparison {
 	int pairs;
 	double difference, integral;
 	double from, to, row;
+	double drift, left; /* of the later view over the whole run, and the difference's mean square without it */
 };
 
 /* shifts: of each view beside `aside`, or NULL; axes: which of them count, those along columns and along rows. */
@@ -94,13 +100,14 @@ static struct comparison compare(const struct reduced *reduced, double (*matrice
 	static const double nowhere[2] = {0};
 	const struct geometry *geometry = &reduced->geometry;
 	struct comparison sums = {.from = geometry->columns, .to = 0};
+	double apart = 0;
 
 	for (int i = 0; i < geometry->count; i++)
 		for (int j = i + 1; j < geometry->count && reduced->known[i]; j++) {
 			const double *const from = geometry->views[i].source, *const to = geometry->views[j].source;
 			const double *const first = shifts != NULL ? shifts[i] : nowhere;
 			const double *const second = shifts != NULL ? shifts[j] : nowhere;
-			double column[2], row[2], value[2];
+			double column[2], row[2], value[2], later;
 
 			/* Neighbours see each other nowhere; opposite sources are in front of each other. */
 			if (!reduced->known[j] || vec_dot(from, to) > 0 ||
@@ -111,6 +118,9 @@ static struct comparison compare(const struct reduced *reduced, double (*matrice
 			    !sample(reduced, j, column[1] + aside + axes[0] * second[0], row[1] + axes[1] * second[1],
 				    &value[1]))
 				continue;
+			later = (reduced->views[j] - reduced->views[i]) / (double)reduced->all;
+			sums.drift += later * (value[1] - value[0]);
+			apart += later * later;
 			sums.difference += pow(value[0] - value[1], 2);
 			sums.integral += (pow(value[0], 2) + pow(value[1], 2)) / 2;
 			sums.from = fmin(sums.from, fmin(column[0], column[1]) + aside);
@@ -120,6 +130,8 @@ static struct comparison compare(const struct reduced *reduced, double (*matrice
 		}
 	if (sums.pairs < PAIRS_LEAST)
 		return (struct comparison){0};
+	sums.drift = apart > 0 ? sums.drift / apart : 0;
+	sums.left = (sums.difference - pow(sums.drift, 2) * apart) / sums.pairs;
 	sums.difference /= sums.pairs;
 	sums.integral /= sums.pairs;
 	sums.row /= sums.pairs;
@@ -207,6 +219,10 @@ int opposite_rays_compare(const struct reduced *reduced, const double axis[3], c
 		ret_rays->share[which] = share_of(&found, all);
 		if (which != OPPOSITE_GIVEN)
 			continue;
+		ret_rays->drift = found.drift;
+		ret_rays->drift_share = found.pairs > 0
+					    ? ret_rays->share[which] * found.left / fmax(found.difference, 1e-30)
+					    : NOTHING_SHOWN;
 		ret_rays->noticed = found.pairs > 0 && ret_rays->share[which] > pow(SHARE_LEAST, 2);
 		ret_rays->empty = found.pairs > 0 && shown(reduced, found.row, found.from, found.to) < EMPTY * all;
 		compare_aside(reduced, matrices, all, ret_rays);
@@ -279,4 +295,10 @@ bool opposite_rays_against_shifts(const struct opposite_rays *rays)
 bool opposite_rays_against_mean(const struct opposite_rays *rays)
 {
 	return is_given_shown(rays) && rays->mean_share > SHIFTED_LARGER * rays->share[OPPOSITE_GIVEN];
+}
+
+bool opposite_rays_drift(const struct opposite_rays *rays)
+{
+	return is_given_shown(rays) && fabs(rays->drift) > DRIFT_LEAST &&
+	       DRIFT_SMALLER * rays->drift_share < fmin(rays->share[OPPOSITE_GIVEN], rays->least_share);
 }

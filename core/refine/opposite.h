@@ -9,6 +9,9 @@
  * the same there if sources and detectors stood as the geometry says. Only the rows about the orbit's plane have such
  * rays, and of a short scan only the views near its ends have.
  *
+ * A tube whose output drifts adds the same to all that a view shows, and the later of two views differs from the
+ * earlier one by as much as they are apart in the run.
+ *
  * The mean square of the differences is taken for the geometry as it is, and for others that a scan's description is
  * mistaken for. Another one than the given geometry takes other columns to be those that two views share, with a
  * displaced detector some that show air only, and air agrees with air: what counts is the difference as a share of the
@@ -38,6 +41,9 @@ struct opposite_rays {
 	double least, least_share, aside;
 	double shifted_share; /* for the given geometry, each view moved by what was found for it */
 	double mean_share;    /* and all views moved by the mean of that along columns */
+	/* What the later of two views has more, as a line integral over the whole run, and the share that this leaves.
+	 */
+	double drift, drift_share;
 };
 
 /*
@@ -59,6 +65,8 @@ bool opposite_rays_near_aside(const struct opposite_rays *rays);
 bool opposite_rays_shifted(const struct opposite_rays *rays);
 /* True if they agree worse by far: the views do not lie aside. */
 bool opposite_rays_against_shifts(const struct opposite_rays *rays);
+/* True if a tube that gives more and more, or less and less, explains what the given geometry does not. */
+bool opposite_rays_drift(const struct opposite_rays *rays);
 /* True if they agree worse by far moved by the mean: detectors do not all stand aside by it. */
 bool opposite_rays_against_mean(const struct opposite_rays *rays);
 

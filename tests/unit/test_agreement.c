@@ -718,6 +718,37 @@ START_TEST(a_reconstruction_tells_it)
 }
 END_TEST
 
+/* The detector cuts the abdomen off, and shows no air: opposite views tell that the tube gives less and less. */
+START_TEST(a_tube_that_drifts_is_told_without_air)
+{
+	static const double falls[] = {0, .15, -.15, 0, .15}, arcs[] = {360, 360, 360, 205, 205};
+	struct arm arm = arm_of(arcs[_i]);
+	struct scene scene;
+	struct outcome outcome = {0};
+	struct recipe recipe;
+
+	arm.columns = 46;
+	scene = (struct scene){.geometry = circle_of(&arm), .projections = take(&arm, ABDOMEN, 20000)};
+	for (int k = 0; k < VIEWS; k++)
+		for (int i = 0; i < arm.columns * ROWS; i++)
+			scene.projections[k * arm.columns * ROWS + i] -= (float)log(1 - falls[_i] * k / (VIEWS - 1));
+	recipe_defaults(&recipe);
+	recipe.fdk.on = true;
+	recipe.has_grid = true;
+	recipe.grid = (struct grid){.size = {24, 24, 16}, .spacing = {8, 8, 8}};
+	run(&scene, &recipe, &outcome);
+	ck_assert_msg((strstr(outcome.warnings, "air_level: ") != NULL) == (falls[_i] != 0), "%s", outcome.warnings);
+	if (falls[_i] != 0) {
+		const char *told = strstr(outcome.warnings, falls[_i] > 0 ? "falls by " : "rises by ");
+
+		ck_assert_msg(told != NULL && fabs(atof(told + 9) - 15) <= 1, "%s", outcome.warnings);
+	}
+	outcome_clear(&outcome);
+	recipe_clear(&recipe);
+	scene_clear(&scene);
+}
+END_TEST
+
 Suite *agreement_suite(void);
 Suite *agreement_suite(void)
 {
@@ -738,6 +769,7 @@ Suite *agreement_suite(void)
 	tcase_add_loop_test(known, a_truncated_head_is_accused_of_no_more_than_is_wrong, 0,
 			    (int)(sizeof(cuts) / sizeof(cuts[0])));
 	tcase_add_loop_test(known, flat_faces_beyond_the_detector_are_not_doubted, 0, 3);
+	tcase_add_loop_test(known, a_tube_that_drifts_is_told_without_air, 0, 5);
 	tcase_add_test(known, a_short_cylinder_under_a_displaced_detector_is_not_doubted);
 	tcase_add_loop_test(known, a_detector_aside_of_a_truncated_abdomen_is_told, 0, 4);
 	tcase_add_loop_test(known, fewer_views_than_64_tell_the_direction_alone, 0, 4);
