@@ -102,12 +102,8 @@ int metal_put(struct metal *metal, const struct grid *grid, const void *bytes, s
 
 /* ---- slice by slice ---- */
 
-/* Returns the new value of voxel i of the list, which has the value `there` in the volume. */
-typedef float voxel_change(struct metal *metal, size_t i, float there, double value);
-
-/* Downloads each slice with metal, changes it at the list's voxels, and puts it back. */
-static int change_slices(struct metal *metal, const struct metal_tools *tools, struct volume *volume,
-			 voxel_change *change, double value, struct error *err)
+int metal_change_slices(struct metal *metal, const struct metal_tools *tools, struct volume *volume,
+			metal_change *change, double value, struct error *err)
 {
 	float *slice = malloc(metal_slice_voxels(tools->grid) * sizeof(float));
 	int code = 0;
@@ -161,12 +157,12 @@ int metal_show(struct metal *metal, const struct metal_tools *tools, struct volu
 		metal->beneath = malloc((metal->voxels_count + 1) * sizeof(float));
 	if (metal->beneath == NULL)
 		return error_set(err, ERR_NO_MEMORY, "no memory for %zu voxels", metal->voxels_count);
-	return change_slices(metal, tools, volume, show, 0, err);
+	return metal_change_slices(metal, tools, volume, show, 0, err);
 }
 
 int metal_hide(struct metal *metal, const struct metal_tools *tools, struct volume *volume, struct error *err)
 {
-	return change_slices(metal, tools, volume, hide, 0, err);
+	return metal_change_slices(metal, tools, volume, hide, 0, err);
 }
 
 /* ---- its traces ---- */
@@ -649,7 +645,7 @@ int metal_fill(struct metal *metal, struct metal *without, const struct metal_to
 	int code = make_prior(tools, &FILLING, err);
 
 	if (code == 0)
-		code = change_slices(without, tools, tools->volume, set, 0, err);
+		code = metal_change_slices(without, tools, tools->volume, set, 0, err);
 	metal->filled = true;
 	return code == 0 ? treat_all(metal, tools, FILL_TO_AIR, err) : code;
 }
@@ -663,7 +659,7 @@ int metal_find_traces(struct metal *metal, const struct metal_tools *tools, stru
 	if (metal->dark_count > 0)
 		qsort(metal->dark, metal->dark_count, sizeof(*metal->dark), metal_compare_traces);
 	if (code == 0)
-		code = change_slices(metal, tools, tools->volume, set_core, 1, err);
+		code = metal_change_slices(metal, tools, tools->volume, set_core, 1, err);
 	return code < 0 ? code : treat_all(metal, tools, TRACE, err);
 }
 
@@ -676,7 +672,7 @@ int metal_replace(struct metal *metal, struct metal *list, const struct metal_to
 		if (code == 0)
 			code = make_prior(tools, pass == 0 ? &FIRST : &LATER, err);
 		if (code == 0)
-			code = change_slices(list, tools, tools->volume, at_least_in_core, tools->mu_water, err);
+			code = metal_change_slices(list, tools, tools->volume, at_least_in_core, tools->mu_water, err);
 		if (code == 0)
 			code = treat_all(metal, tools, FILL_OVER_PRIOR, err);
 	}

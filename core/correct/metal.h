@@ -107,20 +107,26 @@ int metal_take_outside(const struct metal *all, const struct grid *of, const str
 int metal_fdk(const struct metal_tools *tools, struct volume *to, struct error *err);
 
 /* Reliability of the first volume in each place: see metal_blend.c. */
+enum { METAL_LOW, METAL_HIGH, METAL_BANDS };
 struct metal_doubt {
-	float *first;               /* [z][y][x], owned: that volume, on the host */
-	int cell[3], cells[3];      /* voxels a cell, and how many cells there are along the axes */
-	float *expected, *measured; /* [cells], owned: mean squares in each cell */
-	bool cut;                   /* metal lies at the grid's sides */
+	float *first;          /* [z][y][x], owned: that volume, on the host */
+	float *low;            /* likewise: the lower band of what was squared last */
+	float *there;          /* likewise: how much of the means in the lower band there is */
+	bool *hidden;          /* likewise: by metal and its blur */
+	int cell[3], cells[3]; /* voxels a cell, and how many cells there are along the axes */
+	float *expected[METAL_BANDS], *measured[METAL_BANDS]; /* [cells], owned: mean squares in each cell */
+	bool cut;                                             /* metal lies at the grid's sides */
 };
+/* What it takes on the host while volumes are weighed. */
+size_t metal_doubt_bytes(const struct grid *grid);
 void metal_doubt_clear(struct metal_doubt *doubt);
 /*
  * Before metal_replace: from the projections as they were measured and the volume `first`, FDK of them. through: where
  * their residuals come from, the same, or of a larger grid with FDK in its volume to work in; list: metal in that.
+ * That volume, or `first` where it is the same, is the metal alone afterwards.
  */
 int metal_doubt_make(struct metal_doubt *ret_doubt, const struct metal *metal, const struct metal_tools *tools,
-		     struct volume *first, const struct metal_tools *through, const struct metal *list,
-		     struct error *err);
+		     struct volume *first, const struct metal_tools *through, struct metal *list, struct error *err);
 /* The volume, FDK after metal_replace, with a part of the first one where that is the better one. */
 int metal_doubt_blend(struct metal_doubt *doubt, const struct metal *metal, const struct metal_tools *tools,
 		      struct volume *volume, struct error *err);

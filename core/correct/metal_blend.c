@@ -11,19 +11,24 @@
  * the shadows' samples: <(v1 - v2)^2> = s1^2 + s2^2, which is measured. s1 is
  * foretold: it is FDK of the errors that the samples in the shadows must have,
  *
- *   e = noise + RESIDUAL r - STARVED min(1, s),
+ *   e = noise + RESIDUAL r - s / 2 - STARVED exp(1 - 1 / s),
  *
- *   noise  normal deviates of variance s = exp(p) / N, Poisson's; N, the photons
- *          in air, is found from how pixels differ from their neighbours,
+ *   noise  normal deviates of variance s = exp(p) / N, at most 1, Poisson's, of a p that is typical there; N, the
+ *          photons in air, is found from how pixels differ from their neighbours,
  *   r      the mean over a trace of p - A v1 beyond that beside it: 0 for samples that agree with each
  *          other, however blurred the metal is in v1, and not where beams hardened or photons were missing,
- *   s      again: with few photons the logarithm is too small by itself.
+ *   s      again: the logarithm of 1 / s photons is too small by s / 2 in the mean, and exp(-1 / s) of such
+ *          samples have no photon and may miss anything;
+ *
+ * and beside that the metal's streaks of too few views, which v1 alone has: SHARP FDK(A m), m being the metal in v1.
+ * Its edges make them, and voxels have about half of what samples see of those.
  *
  * Where metal lies at the grid's sides e is noise alone: what of it goes on beside the grid is missing in v1 and
  * stays in the samples beside the traces, so that v2 is wrong by more than v1, whatever r is, also in the metal's rim.
  * In a grid smaller than the body all of this is asked of the field of view, whose FDK volume has r (metal_whole.h).
  *
- * Both are squared and averaged over cells of CELL mm.
+ * All are squared and averaged over cells of CELL mm in two bands, each with a b of its own: the lower one, means over
+ * a width of FDK's blur, has little of the noise, none of the streaks, and most of lost bone.
  */
 #include <math.h>
 #include <stdlib.h>
@@ -31,7 +36,7 @@
 
 #include "core/correct/metal_internal.h"
 
-static const double RESIDUAL = 2, STARVED = 12;
+static const double RESIDUAL = 2, STARVED = 12, SHARP = 2;
 static const double CELL = 6; /* mm */
 /* Distance in widths of FDK's blur: nearer to metal, one volume shows its blur and the other does not. */
 static const double BLURRED = 2.5, METAL = 1.5;
@@ -39,8 +44,13 @@ static const double BLURRED = 2.5, METAL = 1.5;
 void metal_doubt_clear(struct metal_doubt *doubt)
 {
 	free(doubt->first);
-	free(doubt->expected);
-	free(doubt->measured);
+	free(doubt->low);
+	free(doubt->there);
+	free(doubt->hidden);
+	for (int band = 0; band < METAL_BANDS; band++) {
+		free(doubt->expected[band]);
+		free(doubt->measured[band]);
+	}
 	*doubt = (struct metal_doubt){0};
 }
 
@@ -204,6 +214,37 @@ struct sides {
 	bool metal, object;
 };
 
+/* The median of up to 5 samples along a row or a column. */
+static float median_along(const struct metal_view *of, int column, int row, int dx, int dy)
+{
+	float values[5];
+	int count = 0;
+
+	for (int i = -2; i <= 2; i++) {
+		const int c = column + i * dx, r = row + i * dy;
+
+		if (c >= 0 && c < of->columns && r >= 0 && r < of->rows)
+			values[count++] = of->values[(size_t)r * (size_t)of->columns + (size_t)c];
+	}
+	qsort(values, (size_t)count, sizeof(*values), compare_floats);
+	return values[count / 2];
+}
+
+/*
+ * The line integral that tells a sample's variance: one with few photons tells its own deviation for it. Along a narrow
+ * shadow others are as dark, across it they are not.
+ */
+static double typical(const struct metal_view *of, int column, int row)
+{
+	return (double)fmaxf(median_along(of, column, row, 1, 0), median_along(of, column, row, 0, 1));
+}
+
+/* How much too small the logarithm of a sample of this variance is. */
+static double starved(double variance)
+{
+	return variance > 0 ? variance / 2 + STARVED * exp(1 - 1 / variance) : 0;
+}
+
 /* `ret_errors` of the pixels that are none of a trace are left alone. */
 static void foretell_view(const struct metal *metal, int view, const struct metal_view *of, double noise,
 			  const float *through, const struct sides *sides, float *ret_errors)
@@ -217,17 +258,39 @@ static void foretell_view(const struct metal *metal, int view, const struct meta
 
 		for (int c = trace->first; c <= trace->last; c++) {
 			const size_t at = (size_t)trace->row * (size_t)of->columns + (size_t)c;
-			const double variance = fmin(noise * exp((double)of->values[at]), 1);
-			const double wrong = sides->metal ? 0 : RESIDUAL * residual - STARVED * variance;
+			const double variance = fmin(noise * exp(typical(of, c, trace->row)), 1);
+			const double wrong = sides->metal ? 0 : RESIDUAL * residual - starved(variance);
 
 			ret_errors[at] = (float)(sqrt(variance) * (double)deviate_of(view, at) + wrong);
 		}
 	}
 }
 
-/* FDK of the errors, into the volume to work in; `from`, of the grid of `through`, is what the residuals are of. */
+/* The streaks' part of the errors, from the metal's projection. */
+static void foretell_streaks(const struct metal *metal, int view, const struct metal_view *of, const float *through,
+			     float *ret_errors)
+{
+	const size_t first = metal_traces_from(metal->traces, metal->traces_count, view);
+	const size_t end = metal_traces_from(metal->traces, metal->traces_count, view + 1);
+
+	for (size_t k = first; k < end; k++)
+		for (int c = metal->traces[k].first; c <= metal->traces[k].last; c++) {
+			const size_t at = (size_t)metal->traces[k].row * (size_t)of->columns + (size_t)c;
+
+			ret_errors[at] = (float)SHARP * through[at];
+		}
+}
+
+/* What is foretold: errors of the samples, or the metal's streaks. */
+enum forecast { OF_SAMPLES, OF_METAL };
+
+/*
+ * FDK of the errors, into the volume to work in; `from`, of the grid of `through`, is what the residuals are of, or the
+ * metal alone.
+ */
 static int foretell(const struct metal *metal, const struct metal_tools *tools, const struct metal_tools *through,
-		    const struct volume *from, const struct sides *sides, double noise, struct error *err)
+		    const struct volume *from, enum forecast what, const struct sides *sides, double noise,
+		    struct error *err)
 {
 	const int all = tools->geometry->count;
 	const size_t pixels = (size_t)tools->geometry->columns * (size_t)tools->geometry->rows;
@@ -246,16 +309,20 @@ static int foretell(const struct metal *metal, const struct metal_tools *tools, 
 							      err);
 		memset(errors, 0, most * sizeof(float));
 		for (int i = 0; i < batch.count && code == 0; i++) {
+			const int view = batch.first + i;
+			const float *shadow = batch.shadow + (size_t)i * pixels;
 			const struct metal_view of = {
 			    .columns = tools->geometry->columns,
 			    .rows = tools->geometry->rows,
 			    .values = batch.views + (size_t)i * pixels,
 			    .grid = through->grid,
-			    .view = &tools->geometry->views[batch.first + i],
+			    .view = &tools->geometry->views[view],
 			};
 
-			foretell_view(metal, batch.first + i, &of, noise, batch.shadow + (size_t)i * pixels, sides,
-				      errors + (size_t)i * pixels);
+			if (what == OF_METAL)
+				foretell_streaks(metal, view, &of, shadow, errors + (size_t)i * pixels);
+			else
+				foretell_view(metal, view, &of, noise, shadow, sides, errors + (size_t)i * pixels);
 		}
 		if (code == 0)
 			code = tools->backend->stack_upload(tools->batch, 0, batch.count, errors, err);
@@ -270,6 +337,21 @@ static int foretell(const struct metal *metal, const struct metal_tools *tools, 
 	return code;
 }
 
+/* The metal above water. */
+static float above(struct metal *metal, size_t i, float there, double value)
+{
+	const struct metal_voxel *voxel = &metal->voxels[i];
+
+	return voxel->kind == METAL_CORE ? fmaxf(voxel->value - (float)value, 0) : there;
+}
+
+static int metal_alone(struct metal *list, const struct metal_tools *through, struct volume *volume, struct error *err)
+{
+	const int code = through->backend->volume_fill(volume, 0, err);
+
+	return code < 0 ? code : metal_change_slices(list, through, volume, above, through->mu_water, err);
+}
+
 /* ---- mean squares in cells ---- */
 
 static size_t cells_of(const struct metal_doubt *doubt)
@@ -277,101 +359,236 @@ static size_t cells_of(const struct metal_doubt *doubt)
 	return (size_t)doubt->cells[0] * (size_t)doubt->cells[1] * (size_t)doubt->cells[2];
 }
 
-/* (1 2 1)/4 along each axis, nothing beyond the ends. */
-static void smooth_cells(const struct metal_doubt *doubt, float *cells)
+/* Values that lie side by side in memory and are smoothed together. */
+enum { SIDE_BY_SIDE = 256 };
+
+/* (1 2 1)/4 along an axis, nothing beyond the ends, over `count` lines side by side. */
+static void smooth_lines(float *values, int length, size_t step, int count)
 {
-	const size_t all = cells_of(doubt);
-	size_t step = 1;
+	float before[SIDE_BY_SIDE] = {0};
 
-	for (int axis = 0; axis < 3; step *= (size_t)doubt->cells[axis], axis++)
-		for (size_t i = 0; i < all; i++) {
-			float before = 0;
+	for (int k = 0; k < length; k++)
+		for (int j = 0; j < count; j++) {
+			float *at = values + (size_t)k * step + j, own = *at;
 
-			if (i / step % (size_t)doubt->cells[axis] != 0)
-				continue; /* once for each line */
-			for (int k = 0; k < doubt->cells[axis]; k++) {
-				float *at = &cells[i + (size_t)k * step], own = *at;
-
-				*at = .5f * own + .25f * (before + (k + 1 < doubt->cells[axis] ? at[step] : 0));
-				before = own;
-			}
+			*at = .5f * own + .25f * (before[j] + (k + 1 < length ? at[step] : 0));
+			before[j] = own;
 		}
 }
 
-/* The mean of the squares of the volume, or of its difference to the first one, in each cell and those around it. */
-static int square_cells(const struct metal_doubt *doubt, const struct metal *metal, const struct metal_tools *tools,
-			struct volume *volume, bool from_first, float *ret_cells, struct error *err)
+/* Along each axis, so many times. */
+static void smooth(float *values, const int size[3], const int passes[3])
+{
+	const size_t all = (size_t)size[0] * (size_t)size[1] * (size_t)size[2];
+	size_t step = 1;
+
+	for (int axis = 0; axis < 3; step *= (size_t)size[axis], axis++) {
+		const size_t block = step * (size_t)size[axis], parts = (step - 1) / SIDE_BY_SIDE + 1;
+
+		for (int pass = 0; pass < passes[axis]; pass++)
+#pragma omp parallel for schedule(static)
+			for (size_t i = 0; i < all / block * parts; i++) {
+				const size_t first = i % parts * SIDE_BY_SIDE, left = step - first;
+
+				smooth_lines(values + i / parts * block + first, size[axis], step,
+					     (int)(left < SIDE_BY_SIDE ? left : SIDE_BY_SIDE));
+			}
+	}
+}
+
+/* Passes of (1 2 1)/4, each of the variance of half a voxel's square, that make means over a width of FDK's blur. */
+static void passes_of(const struct metal_tools *tools, int ret_passes[3])
+{
+	const struct metal_rim rim = metal_rim_of(tools, 1);
+
+	for (int axis = 0; axis < 3; axis++)
+		ret_passes[axis] = (int)lround(2 * rim.radius[axis] * rim.radius[axis]);
+}
+
+/* Marks what a voxel of another grid has in its rim. */
+static void hide_around(struct metal_doubt *doubt, const struct grid *grid, const struct metal_rim *rim,
+			const struct grid *of, const struct metal_voxel *voxel)
+{
+	const double there[3] = {(double)(voxel->at % (uint32_t)of->size[0]),
+				 (double)(voxel->at / (uint32_t)of->size[0]), (double)voxel->z};
+	double middle[3];
+	int low[3], high[3];
+
+	for (int a = 0; a < 3; a++) {
+		middle[a] = (of->origin[a] + there[a] * of->spacing[a] - grid->origin[a]) / grid->spacing[a];
+		low[a] = (int)fmax(0, ceil(middle[a] - rim->radius[a]));
+		high[a] = (int)fmin(grid->size[a] - 1, floor(middle[a] + rim->radius[a]));
+	}
+	for (int z = low[2]; z <= high[2]; z++)
+		for (int y = low[1]; y <= high[1]; y++)
+			for (int x = low[0]; x <= high[0]; x++) {
+				const double d[3] = {(x - middle[0]) / rim->radius[0], (y - middle[1]) / rim->radius[1],
+						     (z - middle[2]) / rim->radius[2]};
+
+				if (d[0] * d[0] + d[1] * d[1] + d[2] * d[2] <= 1)
+					doubt->hidden[grid_voxel(grid, x, y, z)] = true;
+			}
+}
+
+/* Which voxels are hidden by metal or its blur, and how much of a mean over the others there is at each voxel. */
+static int find_hidden(struct metal_doubt *doubt, const struct metal *metal, const struct metal_tools *tools,
+		       const struct metal *all, const struct grid *of, struct error *err)
 {
 	const struct grid *grid = tools->grid;
 	const struct metal_rim rim = metal_rim_of(tools, BLURRED);
-	const size_t slice = metal_slice_voxels(grid), nx = (size_t)grid->size[0];
-	float *values = malloc(slice * sizeof(float)), *marks = malloc(slice * sizeof(float));
-	float *counts = calloc(cells_of(doubt), sizeof(float));
-	int code = 0;
+	const size_t slice = metal_slice_voxels(grid);
+	float *marks = malloc(slice * sizeof(float));
+	int passes[3];
 
-	if (values == NULL || marks == NULL || counts == NULL)
-		code = error_set(err, ERR_NO_MEMORY, "no memory for a slice");
-	for (int z = 0; z < grid->size[2] && code == 0; z++) {
+	if (marks == NULL)
+		return error_set(err, ERR_NO_MEMORY, "no memory for a slice");
+	for (int z = 0; z < grid->size[2]; z++) {
 		const bool marked = metal_mark_slice(metal, grid, &rim, z, marks);
-		const size_t layer = (size_t)(z / doubt->cell[2]) * (size_t)doubt->cells[1];
 
-		code = cancel_check(tools->cancel, err);
-		if (code == 0)
-			code = tools->backend->volume_download(volume, z, 1, values, err);
-		for (size_t i = 0; i < slice && code == 0; i++) {
-			const size_t line = layer + i / nx / (size_t)doubt->cell[1];
-			const size_t cell = line * (size_t)doubt->cells[0] + i % nx / (size_t)doubt->cell[0];
-			const float value = values[i] - (from_first ? doubt->first[(size_t)z * slice + i] : 0);
-
-			if (marked && marks[i] > 0)
-				continue;
-			ret_cells[cell] += value * value;
-			counts[cell]++;
-		}
+		for (size_t i = 0; i < slice; i++)
+			doubt->hidden[(size_t)z * slice + i] = marked && marks[i] > 0;
 	}
-	if (code == 0) {
-		smooth_cells(doubt, ret_cells);
-		smooth_cells(doubt, counts);
-		for (size_t i = 0; i < cells_of(doubt); i++)
-			ret_cells[i] /= fmaxf(counts[i], 1e-3f);
+	for (size_t i = 0; i < all->voxels_count && all != metal; i++)
+		if (all->voxels[i].kind == METAL_CORE)
+			hide_around(doubt, grid, &rim, of, &all->voxels[i]);
+	for (size_t i = 0; i < grid_voxels(grid); i++)
+		doubt->there[i] = doubt->hidden[i] ? 0 : 1;
+	passes_of(tools, passes);
+	smooth(doubt->there, grid->size, passes);
+	free(marks);
+	return 0;
+}
+
+/* Means of a volume over the voxels that are not hidden. */
+static void find_low(const struct metal_doubt *doubt, const struct metal_tools *tools, const float *values,
+		     float *ret_low)
+{
+	const size_t all = grid_voxels(tools->grid);
+	int passes[3];
+
+#pragma omp parallel for schedule(static)
+	for (size_t i = 0; i < all; i++)
+		ret_low[i] = doubt->hidden[i] ? 0 : values[i];
+	passes_of(tools, passes);
+	smooth(ret_low, tools->grid->size, passes);
+#pragma omp parallel for schedule(static)
+	for (size_t i = 0; i < all; i++)
+		ret_low[i] = doubt->there[i] > 0 ? ret_low[i] / doubt->there[i] : 0;
+}
+
+/*
+ * Adds to each cell the mean of the squares of a volume, or of its difference to the first one, in it and those around
+ * it, of each band that is asked for. `low` has its lower band then.
+ */
+static int square_cells(const struct metal_doubt *doubt, const struct metal_tools *tools, struct volume *volume,
+			bool from_first, float *const ret_cells[METAL_BANDS], struct error *err)
+{
+	const struct grid *grid = tools->grid;
+	const size_t slice = metal_slice_voxels(grid), nx = (size_t)grid->size[0], all = cells_of(doubt);
+	const int once[3] = {1, 1, 1};
+	float *values = malloc(grid_voxels(grid) * sizeof(float)),
+	      *cells = calloc((METAL_BANDS + 1) * all, sizeof(float));
+	float *counts = cells != NULL ? cells + METAL_BANDS * all : NULL;
+	int code = cancel_check(tools->cancel, err);
+
+	if (code == 0 && (values == NULL || cells == NULL))
+		code = error_set(err, ERR_NO_MEMORY, "no memory for a volume of %zu voxels", grid_voxels(grid));
+	if (code == 0)
+		code = tools->backend->volume_download(volume, 0, grid->size[2], values, err);
+	for (size_t i = 0; i < grid_voxels(grid) && code == 0 && from_first; i++)
+		values[i] -= doubt->first[i];
+	if (code == 0)
+		find_low(doubt, tools, values, doubt->low);
+	for (size_t i = 0; i < grid_voxels(grid) && code == 0; i++) {
+		const size_t x = i % nx, y = i % slice / nx, z = i / slice;
+		const size_t line = z / (size_t)doubt->cell[2] * (size_t)doubt->cells[1] + y / (size_t)doubt->cell[1];
+		const size_t cell = line * (size_t)doubt->cells[0] + x / (size_t)doubt->cell[0];
+		const float low = doubt->low[i], high = values[i] - low;
+
+		if (doubt->hidden[i])
+			continue;
+		cells[METAL_LOW * all + cell] += low * low;
+		cells[METAL_HIGH * all + cell] += high * high;
+		counts[cell]++;
+	}
+	if (code == 0)
+		smooth(counts, doubt->cells, once);
+	for (int band = 0; band < METAL_BANDS && code == 0; band++) {
+		if (ret_cells[band] == NULL)
+			continue;
+		smooth(cells + (size_t)band * all, doubt->cells, once);
+		for (size_t i = 0; i < all; i++)
+			ret_cells[band][i] += cells[(size_t)band * all + i] / fmaxf(counts[i], 1e-3f);
 	}
 	free(values);
-	free(marks);
-	free(counts);
+	free(cells);
 	return code;
 }
 
-int metal_doubt_make(struct metal_doubt *ret_doubt, const struct metal *metal, const struct metal_tools *tools,
-		     struct volume *first, const struct metal_tools *through, const struct metal *list,
-		     struct error *err)
+size_t metal_doubt_bytes(const struct grid *grid)
 {
-	const struct grid *grid = tools->grid;
-	struct metal_doubt doubt = {.first = malloc(grid_voxels(grid) * sizeof(float))};
-	double noise = 0;
-	int code = 0;
+	return grid_voxels(grid) * (4 * sizeof(float) + sizeof(bool)); /* with the volume that is squared */
+}
+
+static int make_room(struct metal_doubt *doubt, const struct grid *grid, struct error *err)
+{
+	const size_t voxels = grid_voxels(grid);
+	bool enough;
 
 	for (int a = 0; a < 3; a++) {
-		doubt.cell[a] = (int)fmax(1, lround(CELL / grid->spacing[a]));
-		doubt.cells[a] = (grid->size[a] + doubt.cell[a] - 1) / doubt.cell[a];
+		doubt->cell[a] = (int)fmax(1, lround(CELL / grid->spacing[a]));
+		doubt->cells[a] = (grid->size[a] + doubt->cell[a] - 1) / doubt->cell[a];
 	}
-	doubt.expected = calloc(cells_of(&doubt), sizeof(float));
-	doubt.measured = calloc(cells_of(&doubt), sizeof(float));
-	if (doubt.first == NULL || doubt.expected == NULL || doubt.measured == NULL)
-		code = error_set(err, ERR_NO_MEMORY, "no memory for a volume of %zu voxels", grid_voxels(grid));
-	if (code == 0)
-		code = tools->backend->volume_download(first, 0, grid->size[2], doubt.first, err);
-	if (code == 0)
-		code = find_noise(tools, &noise, err);
-	if (code == 0) {
-		/* In a grid larger than the recipe's, FDK has a haze in the air around the body. */
-		const struct sides sides = {lies_at_sides(list, through->grid),
-					    through != tools || goes_on_aside(doubt.first, grid, tools->mu_water)};
+	doubt->first = malloc(voxels * sizeof(float));
+	doubt->low = malloc(voxels * sizeof(float));
+	doubt->there = malloc(voxels * sizeof(float));
+	doubt->hidden = malloc(voxels * sizeof(bool));
+	enough = doubt->first != NULL && doubt->low != NULL && doubt->there != NULL && doubt->hidden != NULL;
+	for (int band = 0; band < METAL_BANDS; band++) {
+		doubt->expected[band] = calloc(cells_of(doubt), sizeof(float));
+		doubt->measured[band] = calloc(cells_of(doubt), sizeof(float));
+		enough = enough && doubt->expected[band] != NULL && doubt->measured[band] != NULL;
+	}
+	return enough ? 0 : error_set(err, ERR_NO_MEMORY, "no memory for a volume of %zu voxels", voxels);
+}
 
-		doubt.cut = sides.metal;
-		code = foretell(metal, tools, through, through == tools ? first : through->volume, &sides, noise, err);
-	}
+/* Mean squares of the errors that the first volume must have. */
+static int foretell_cells(struct metal_doubt *doubt, const struct metal *metal, const struct metal_tools *tools,
+			  const struct metal_tools *through, struct volume *from, struct metal *list, struct error *err)
+{
+	/* In a grid larger than the recipe's, FDK has a haze in the air around the body. */
+	const struct sides sides = {lies_at_sides(list, through->grid),
+				    through != tools || goes_on_aside(doubt->first, tools->grid, tools->mu_water)};
+	/* A streak is as narrow as a ray: what is wide beside metal is no streak. */
+	float *const streaks[METAL_BANDS] = {[METAL_HIGH] = doubt->expected[METAL_HIGH]};
+	double noise = 0;
+	int code = find_noise(tools, &noise, err);
+
+	doubt->cut = sides.metal;
 	if (code == 0)
-		code = square_cells(&doubt, metal, tools, tools->volume, false, doubt.expected, err);
+		code = foretell(metal, tools, through, from, OF_SAMPLES, &sides, noise, err);
+	if (code == 0)
+		code = square_cells(doubt, tools, tools->volume, false, doubt->expected, err);
+	if (code == 0)
+		code = metal_alone(list, through, from, err);
+	if (code == 0)
+		code = foretell(metal, tools, through, from, OF_METAL, &sides, noise, err);
+	return code == 0 ? square_cells(doubt, tools, tools->volume, false, streaks, err) : code;
+}
+
+int metal_doubt_make(struct metal_doubt *ret_doubt, const struct metal *metal, const struct metal_tools *tools,
+		     struct volume *first, const struct metal_tools *through, struct metal *list, struct error *err)
+{
+	struct metal_doubt doubt = {0};
+	int code = make_room(&doubt, tools->grid, err);
+
+	if (code == 0)
+		code = tools->backend->volume_download(first, 0, tools->grid->size[2], doubt.first, err);
+	if (code == 0)
+		code = find_hidden(&doubt, metal, tools, list, through->grid, err);
+	if (code == 0)
+		code = foretell_cells(&doubt, metal, tools, through, through == tools ? first : through->volume, list,
+				      err);
 	if (code < 0) {
 		metal_doubt_clear(&doubt);
 		return code;
@@ -393,12 +610,15 @@ static float between(const struct metal_doubt *doubt, int axis, int index, size_
 	return at - (float)ret[0];
 }
 
-/* b of every cell, instead of `measured`. */
+/* b of every cell and band, instead of `measured`. */
 static void weigh(const struct metal_doubt *doubt)
 {
-	for (size_t i = 0; i < cells_of(doubt); i++)
-		doubt->measured[i] =
-		    doubt->measured[i] > doubt->expected[i] ? 1 - doubt->expected[i] / doubt->measured[i] : 0;
+	for (int band = 0; band < METAL_BANDS; band++)
+		for (size_t i = 0; i < cells_of(doubt); i++) {
+			const float expected = doubt->expected[band][i], measured = doubt->measured[band][i];
+
+			doubt->measured[band][i] = measured > expected ? 1 - expected / measured : 0;
+		}
 }
 
 static void blend_slice(const struct metal_doubt *doubt, const struct grid *grid, int z, const float *marks,
@@ -407,6 +627,7 @@ static void blend_slice(const struct metal_doubt *doubt, const struct grid *grid
 	const size_t nx = (size_t)grid->size[0], across = (size_t)doubt->cells[0];
 	const size_t layer = across * (size_t)doubt->cells[1];
 	const float *first = doubt->first + (size_t)z * metal_slice_voxels(grid);
+	const float *low = doubt->low + (size_t)z * metal_slice_voxels(grid);
 
 #pragma omp parallel for schedule(static)
 	for (int y = 0; y < grid->size[1]; y++)
@@ -415,17 +636,21 @@ static void blend_slice(const struct metal_doubt *doubt, const struct grid *grid
 			size_t at[3][2];
 			const float part[3] = {between(doubt, 0, x, at[0]), between(doubt, 1, y, at[1]),
 					       between(doubt, 2, z, at[2])};
-			float weight = 0;
+			float weights[METAL_BANDS] = {0};
 
 			for (int k = 0; k < 8; k++) {
 				const int a = k & 1, b = k >> 1 & 1, c = k >> 2;
+				const size_t cell = at[2][c] * layer + at[1][b] * across + at[0][a];
+				const float share = (a ? part[0] : 1 - part[0]) * (b ? part[1] : 1 - part[1]) *
+						    (c ? part[2] : 1 - part[2]);
 
-				weight += (a ? part[0] : 1 - part[0]) * (b ? part[1] : 1 - part[1]) *
-					  (c ? part[2] : 1 - part[2]) *
-					  doubt->measured[at[2][c] * layer + at[1][b] * across + at[0][a]];
+				for (int band = 0; band < METAL_BANDS; band++)
+					weights[band] += share * doubt->measured[band][cell];
 			}
+			/* `low` is of the second volume less the first. */
 			if (marks == NULL || marks[i] == 0)
-				values[i] += weight * (first[i] - values[i]);
+				values[i] -=
+				    weights[METAL_LOW] * low[i] + weights[METAL_HIGH] * (values[i] - first[i] - low[i]);
 		}
 }
 
@@ -436,7 +661,7 @@ int metal_doubt_blend(struct metal_doubt *doubt, const struct metal *metal, cons
 	const struct metal_rim rim = metal_rim_of(tools, METAL);
 	const size_t slice = metal_slice_voxels(grid);
 	float *values = malloc(slice * sizeof(float)), *marks = malloc(slice * sizeof(float));
-	int code = square_cells(doubt, metal, tools, volume, true, doubt->measured, err);
+	int code = square_cells(doubt, tools, volume, true, doubt->measured, err);
 
 	if (code == 0 && (values == NULL || marks == NULL))
 		code = error_set(err, ERR_NO_MEMORY, "no memory for a slice");

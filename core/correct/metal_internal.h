@@ -9,6 +9,12 @@ size_t metal_slice_voxels(const struct grid *grid);
 /* `items` with room for one more than `count`; NULL, and they are as they were, where there is no memory. */
 void *metal_grown(void *items, size_t size, size_t count, size_t *room);
 
+/* Returns the new value of voxel i of the list, which has the value `there` in the volume. */
+typedef float metal_change(struct metal *metal, size_t i, float there, double value);
+/* Downloads each slice with metal, changes it at the list's voxels, and puts it back. */
+int metal_change_slices(struct metal *metal, const struct metal_tools *tools, struct volume *volume,
+			metal_change *change, double value, struct error *err);
+
 /* First of the list's voxels of this slice or a later one. */
 size_t metal_voxels_from(const struct metal *metal, int z);
 /*

@@ -13,10 +13,10 @@ static bool wanted(const struct recipe *recipe, const struct linearise *linearis
 	return recipe->metal.on;
 }
 
-/* The volume that metal_doubt_make copies, and that of the whole field of view. */
+/* What volumes are weighed with, and the volume of the whole field of view. */
 static int bytes_of(const struct correction_ask *ask, struct correction_bytes *bytes, struct error *err)
 {
-	bytes->host += grid_voxels(&ask->recipe->grid) * sizeof(float);
+	bytes->host += metal_doubt_bytes(&ask->recipe->grid);
 	return metal_whole_bytes(ask, bytes, err);
 }
 
@@ -338,7 +338,7 @@ const struct correction correction_metal = {
     .times =
 	1U << CORRECT_LINE_INTEGRALS | 1U << CORRECT_AFTER_FDK | 1U << CORRECT_BEFORE_ITERATING | 1U << CORRECT_RESUMED,
     .needs = NEEDS_WHOLE_IMAGES | NEEDS_ALL_VIEWS | NEEDS_VOLUME,
-    .work = 12,
+    .work = 14,
     .wanted = wanted,
     .slots = metal_slots,
     .bytes = bytes_of,
