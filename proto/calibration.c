@@ -14,7 +14,10 @@ static const double degree = M_PI / 180;
 static const double length_least = 1e-3, length_most = 1000; /* mm, of phantoms */
 static const double angle_most = 360;                        /* degrees */
 
-/* By how much an arm's distances may differ from the nominal ones without a word; before diameters had an error. */
+/*
+ * By how much an arm's distances may differ from the nominal ones without a word: as these are known, beside what the
+ * scan itself leaves open. The second is of documents of before diameters had an error.
+ */
 static const double distance_open = .01, distance_open_before = .03;
 
 /* ---- phantoms ---- */
@@ -354,6 +357,7 @@ cJSON *calibration_json(const struct calibration *calibration)
 	cJSON_AddNumberToObject(json, "diameter_ratio", calibration->diameter_ratio);
 	cJSON_AddNumberToObject(json, "diameter_error", calibration->diameter_error);
 	cJSON_AddNumberToObject(json, "distance_ratio", calibration->distance_ratio);
+	cJSON_AddNumberToObject(json, "distance_error", calibration->distance_error);
 	cJSON_AddNumberToObject(json, "explained_mm", calibration->explained);
 	cJSON_AddNumberToObject(json, "balls_moved_mm", calibration->adjusted_rms);
 	list = cJSON_AddArrayToObject(json, "balls_mm");
@@ -398,7 +402,9 @@ cJSON *calibration_doubts(const cJSON *json)
 	const double machined = .1; /* mm, by which balls may lie off their drawing */
 	const double shadows = number_of(json, "diameter_ratio", 1), sources = number_of(json, "distance_ratio", 1);
 	const double shadows_open = number_of(json, "diameter_error", distance_open_before),
-		     sources_open = cJSON_HasObjectItem(json, "diameter_error") ? distance_open : distance_open_before;
+		     sources_open = cJSON_HasObjectItem(json, "diameter_error")
+					? hypot(distance_open, number_of(json, "distance_error", 0))
+					: distance_open_before;
 	const double residual = number_of(json, "residual_isocentre_mm", 0),
 		     moved = number_of(json, "balls_moved_mm", 0);
 	const double limit = hypot(machined, number_of(json, "explained_mm", INFINITY));

@@ -144,23 +144,36 @@ static int adjust_balls(struct run *run, struct error *err)
 	return 0;
 }
 
-/* Mean distance of the sources from their middle plane's centre, of the found ones over the nominal ones. */
-static double scale_ratio(const struct run *run)
+/*
+ * Distances of the sources from the isocentre over the nominal ones: their mean, and by how much views differ. What
+ * each view's own noise makes of that goes out of the mean with their number.
+ */
+static void measure_distances(const struct run *run)
 {
-	const struct calibration *calibration = run->calibration;
-	double is = 0, was = 0;
+	struct calibration *calibration = run->calibration;
+	double sum = 0, squares = 0, noise = 0, count = 0;
 
 	for (int k = 0; k < calibration->count; k++) {
-		const struct pose *pose = &run->works[k].pose;
-		struct pose nominal;
+		const struct calibrated_view *view = &calibration->views[k];
+		const struct work *work = &run->works[k];
+		double nominal, off, own;
 
-		if (!calibration->views[k].used)
+		if (!view->used)
 			continue;
-		pose_of_view(&nominal, &run->request->nominal->views[k]);
-		is += vec_norm(pose->source);
-		was += vec_norm(nominal.source);
+		nominal = vec_norm(run->request->nominal->views[k].source);
+		off = vec_norm(work->pose.source) / nominal - 1;
+		own = noise_of(view->rms, work->pair_count) / nominal *
+		      certainty_of(&work->pose, run->request->pixel_mm, &calibration->balls, work->pairs,
+				   work->pair_count)
+			  .distance;
+		sum += off;
+		squares += off * off;
+		noise += own * own;
+		count++;
 	}
-	return was > 0 ? is / was : 1;
+	calibration->distance_ratio = 1 + sum / count;
+	calibration->distance_error =
+	    sqrt(fmax(0, (squares - sum * sum / count) / fmax(1, count - 1) - noise / count) + noise / (count * count));
 }
 
 /* Residuals over all views, and by how much the phantom was turned and its shadows are too large. */
@@ -192,7 +205,7 @@ static int summarise(struct run *run, struct error *err)
 	calibration->rms = sqrt(squares / count);
 	calibration->rms_isocentre = sqrt(squares_isocentre / count);
 	calibration->turn = atan2(across, along);
-	calibration->distance_ratio = scale_ratio(run);
+	measure_distances(run);
 	code = diameters_measure(run, &diameters, err);
 	if (code < 0)
 		return code;

@@ -113,7 +113,13 @@ struct calibration {
 	double diameter_error; /* of this ratio: what noise and blur leave open */
 	double explained;      /* mm at the isocentre, of rms_isocentre, that noise and centring may make up */
 	double distance_ratio; /* of the sources' mean distance from the isocentre to the nominal one */
-	double adjusted_rms;   /* mm, by which balls were moved; 0 unless asked for */
+	/*
+	 * Of this ratio: the standard deviation of the views' own, of which noise goes out of the mean with their
+	 * number. An arm that sags, and a phantom beside the axis, which over a short sweep has most sources on its one
+	 * side, make views differ; what they have in common may be as large.
+	 */
+	double distance_error;
+	double adjusted_rms; /* mm, by which balls were moved; 0 unless asked for */
 };
 
 /*
