@@ -52,6 +52,8 @@ const struct warning_kind warning_kinds[] = {
      "Something in the patient moved to and fro while the arm turned, as with breathing: what moved is blurred or "
      "doubled in the image."},
     /* ---- of a calibration, and of a scan that uses one ---- */
+    {"calibration_balls", SEVERITY_CAUTION,
+     "The drawing of the phantom that the arm was calibrated with may have more or fewer balls than the phantom."},
     {"calibration_interpolated", SEVERITY_INFO,
      "The arm's places in this scan are interpolated between those that were calibrated."},
     {"calibration_old", SEVERITY_CAUTION,

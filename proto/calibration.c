@@ -358,6 +358,8 @@ cJSON *calibration_json(const struct calibration *calibration)
 	cJSON_AddNumberToObject(json, "diameter_error", calibration->diameter_error);
 	cJSON_AddNumberToObject(json, "distance_ratio", calibration->distance_ratio);
 	cJSON_AddNumberToObject(json, "distance_error", calibration->distance_error);
+	cJSON_AddNumberToObject(json, "interpolated_pixels", calibration->between);
+	cJSON_AddNumberToObject(json, "interpolated_isocentre_mm", calibration->between_isocentre);
 	cJSON_AddNumberToObject(json, "explained_mm", calibration->explained);
 	cJSON_AddNumberToObject(json, "balls_moved_mm", calibration->adjusted_rms);
 	list = cJSON_AddArrayToObject(json, "balls_mm");
@@ -367,6 +369,14 @@ cJSON *calibration_json(const struct calibration *calibration)
 
 		json_append(list, cJSON_CreateDoubleArray(numbers, 4));
 	}
+	list = cJSON_AddArrayToObject(json, "presence");
+	for (int b = 0; b < calibration->balls.count; b++) {
+		const int numbers[2] = {calibration->presence[b].expected, calibration->presence[b].found};
+
+		json_append(list, cJSON_CreateIntArray(numbers, 2));
+	}
+	cJSON_AddNumberToObject(json, "stray_shadows", calibration->strays);
+	cJSON_AddNumberToObject(json, "stray_views", calibration->stray_views);
 	list = cJSON_AddArrayToObject(json, "views");
 	for (int k = 0; k < calibration->count; k++) {
 		views[k] = calibration->views[k].view;
@@ -391,6 +401,69 @@ static void add_doubt(cJSON *doubts, const char *code, const char *detail)
 	cJSON_AddStringToObject(doubt, "code", code);
 	cJSON_AddStringToObject(doubt, "detail", detail);
 	json_append(doubts, doubt);
+}
+
+static const int views_least = 3; /* that tell of a ball */
+
+/* Balls of the drawing that were never seen, in words; "" for none. */
+static void tell_unseen(const cJSON *json, char *text, size_t size)
+{
+	const cJSON *entry;
+	char balls[120] = "";
+	int ball = 0, unseen = 0, most = 0;
+
+	cJSON_ArrayForEach(entry, cJSON_GetObjectItemCaseSensitive(json, "presence"))
+	{
+		const int expected = cJSON_GetArrayItem(entry, 0)->valueint,
+			  found = cJSON_GetArrayItem(entry, 1)->valueint;
+
+		/* Another's shadow may lie there by chance. */
+		if (expected >= views_least && 10 * found <= expected) {
+			const size_t length = strlen(balls);
+
+			if (length + 16 < sizeof(balls))
+				snprintf(balls + length, sizeof(balls) - length, "%s%d", unseen > 0 ? ", " : "", ball);
+			else if (balls[length - 1] != '.')
+				snprintf(balls + length, sizeof(balls) - length, " ...");
+			unseen++;
+			most = expected > most ? expected : most;
+		}
+		ball++;
+	}
+	text[0] = '\0';
+	if (unseen == 1)
+		snprintf(text, size,
+			 "ball %s of the drawing (counted from 0) is not where the drawing has it, in %d views that "
+			 "would show "
+			 "it alone",
+			 balls, most);
+	if (unseen > 1)
+		snprintf(text, size,
+			 "balls %s of the drawing (counted from 0) are not where the drawing has them, in up to %d "
+			 "views that "
+			 "would show each alone",
+			 balls, most);
+}
+
+/* The phantom may have a ball that the drawing has not, or the other way about. */
+static void doubt_balls(const cJSON *json, cJSON *doubts)
+{
+	const double used = number_of(json, "used", 0), views = number_of(json, "stray_views", 0);
+	char detail[480], unseen[280], strays[120] = "";
+
+	tell_unseen(json, unseen, sizeof(unseen));
+	/* As a ball of the drawing, one beside it stands clear in some views only. */
+	if (views >= views_least && 4 * views >= used)
+		snprintf(strays, sizeof(strays),
+			 "%s%.0f shadows of balls, in %.0f of %.0f views, are of no ball of the drawing",
+			 unseen[0] != '\0' ? "; " : "", number_of(json, "stray_shadows", 0), views, used);
+	if (unseen[0] == '\0' && strays[0] == '\0')
+		return;
+	snprintf(detail, sizeof(detail), "%s%s: the drawing may have %s than the phantom", unseen, strays,
+		 unseen[0] == '\0'   ? "fewer balls"
+		 : strays[0] == '\0' ? "more balls"
+				     : "other balls");
+	add_doubt(doubts, "calibration_balls", detail);
 }
 
 /*
@@ -431,5 +504,6 @@ cJSON *calibration_doubts(const cJSON *json)
 		    residual, moved, machined, limit);
 		add_doubt(doubts, "calibration_shape", detail);
 	}
+	doubt_balls(json, doubts);
 	return doubts;
 }

@@ -77,6 +77,12 @@ static void result_say(const struct calibration *calibration, const cJSON *docum
 			"possible to "
 			"where the nominal geometry has it\n",
 			calibration->rival_turn * 180 / M_PI);
+	if (calibration->used < calibration->count && calibration->between > 0)
+		fprintf(stderr,
+			"poses between neighbours' are %.2f pixels, %.2f mm at the isocentre off (RMS), as the views "
+			"tell that "
+			"are used\n",
+			calibration->between, calibration->between_isocentre);
 	for (int k = 0; k < calibration->count; k++)
 		if (!calibration->views[k].used)
 			fprintf(stderr, "view %d is not used, its pose is between its neighbours': %s\n", k,

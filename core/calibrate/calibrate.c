@@ -334,9 +334,10 @@ static int run_open(struct run *run, struct calibration *calibration, const stru
 	*run = (struct run){.request = request, .calibration = calibration, .least = INFINITY};
 	*calibration = (struct calibration){.count = count};
 	calibration->views = calloc((size_t)count, sizeof(*calibration->views));
+	calibration->presence = calloc((size_t)request->balls->count, sizeof(*calibration->presence));
 	run->works = calloc((size_t)count, sizeof(*run->works));
 	run->matches = calloc((size_t)count, sizeof(*run->matches));
-	if (calibration->views == NULL || run->works == NULL || run->matches == NULL)
+	if (calibration->views == NULL || calibration->presence == NULL || run->works == NULL || run->matches == NULL)
 		return error_set(err, ERR_NO_MEMORY, "no memory for %d views", count);
 	for (int k = 0; k < count; k++) {
 		calibration->views[k].view = request->nominal->views[k];
@@ -396,10 +397,14 @@ int calibrate(struct calibration *ret_calibration, const struct calibrate_reques
 		code = sweep_refuse(&calibration, request, err);
 	if (code == 0 && request->adjust_balls)
 		code = adjust_balls(&run, err);
-	if (code == 0)
+	if (code == 0) {
+		presence_count(&run);
 		code = summarise(&run, err);
+	}
 	if (code == 0)
 		code = check_result(&run, turn, err);
+	if (code == 0)
+		code = sweep_error(&calibration, request, err);
 	if (code == 0)
 		code = sweep_fill(&calibration, request->nominal, err);
 	run_close(&run);
@@ -413,6 +418,7 @@ int calibrate(struct calibration *ret_calibration, const struct calibrate_reques
 void calibration_clear(struct calibration *calibration)
 {
 	free(calibration->views);
+	free(calibration->presence);
 	balls_clear(&calibration->balls);
 	memset(calibration, 0, sizeof(*calibration));
 }

@@ -18,6 +18,7 @@
  *   view.c     all of these for each view
  *   bundle.c   all views and the balls' own places at once, where that is asked for
  *   diameters.c  the balls' diameters against the drawing's
+ *   presence.c  balls that were never seen, shadows that are of none
  *   follow.c   views that look the same from another side
  *   sweep.c    views that do not follow their neighbours; poses between calibrated ones
  *
@@ -98,12 +99,19 @@ struct calibrated_view {
 	char refused[192];    /* one sentence with the numbers, "" when used */
 };
 
+/* Views that are used and should show a ball clear of others', and those of them in which its shadow was. */
+struct ball_presence {
+	int expected, found;
+};
+
 struct calibration {
-	int count, used;               /* views */
-	struct calibrated_view *views; /* [count], owned */
-	struct balls balls;            /* as they are, or as they were adjusted; owned */
-	double rms, rms_isocentre;     /* pixels, mm: over all shadows used */
-	double turn;                   /* radians about z by which the phantom stood turned against its drawing */
+	int count, used;                /* views */
+	struct calibrated_view *views;  /* [count], owned */
+	struct balls balls;             /* as they are, or as they were adjusted; owned */
+	struct ball_presence *presence; /* [balls.count], owned */
+	int strays, stray_views;        /* shadows like a ball's that are of no ball, and views with such a one */
+	double rms, rms_isocentre;      /* pixels, mm: over all shadows used */
+	double turn;                    /* radians about z by which the phantom stood turned against its drawing */
 	/*
 	 * Radians, of a few degrees' resolution, by which the phantom could as well stand turned further: balls of one
 	 * size at equal steps look the same. The turn nearest to the nominal geometry was taken. 0: no other turn fits.
@@ -119,13 +127,18 @@ struct calibration {
 	 * side, make views differ; what they have in common may be as large.
 	 */
 	double distance_error;
+	/*
+	 * Pixels and mm, RMS over the balls and views: how far views that are used stand from where views that are not
+	 * used are put, by neighbours as far away as those of the longest run of these have them. 0: not known.
+	 */
+	double between, between_isocentre;
 	double adjusted_rms; /* mm, by which balls were moved; 0 unless asked for */
 };
 
 /*
- * Allocates ret->views and ret->balls.ball; free with calibration_clear. ERR_IMPOSSIBLE with the numbers: pictures
- * without shadows or of counts, another phantom, another diameter, or more than a quarter of the views refused. Uses
- * all threads; the same images give the same bits for any number of them.
+ * Allocates ret->views, ret->balls.ball and ret->presence; free with calibration_clear. ERR_IMPOSSIBLE with the
+ * numbers: pictures without shadows or of counts, another phantom, another diameter, or more than a quarter of the
+ * views refused. Uses all threads; the same images give the same bits for any number of them.
  */
 int calibrate(struct calibration *ret_calibration, const struct calibrate_request *request, struct error *err);
 void calibration_clear(struct calibration *calibration);

@@ -192,6 +192,10 @@ struct diameters {
 /* There is a view that is used. */
 int diameters_measure(const struct run *run, struct diameters *ret, struct error *err);
 
+/* ---- presence.c ---- */
+/* Writes calibration->presence, strays and stray_views, by the views that are used. */
+void presence_count(struct run *run);
+
 /* ---- sweep.c ---- */
 /* A view's place in the order of the angles. */
 struct station {
@@ -212,6 +216,8 @@ int sweep_between(const struct calibration *calibration, const struct geometry *
 		  struct error *err);
 /* Gives views that are not used the pose between their neighbours'. */
 int sweep_fill(struct calibration *calibration, const struct geometry *nominal, struct error *err);
+/* What poses between neighbours are worth, by those that are used: calibration->between and between_isocentre. */
+int sweep_error(struct calibration *calibration, const struct calibrate_request *request, struct error *err);
 
 /* ---- follow.c ---- */
 /*

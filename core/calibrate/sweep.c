@@ -154,15 +154,18 @@ int calibration_between(struct geometry *ret_geometry, const struct geometry *no
 	return code;
 }
 
-/* The stations next to one of the list, before and after it, whose views are used; NULL where there is none. */
+/*
+ * The stations next to one of the list, before and after it, whose views are used; NULL where there is none. So many on
+ * either side are taken for not used.
+ */
 static void neighbours(const struct calibration *calibration, const struct station *stations, int at,
-		       const struct station *ret[2])
+		       const int aside[2], const struct station *ret[2])
 {
 	const int count = calibration->count;
 
 	for (int side = 0; side < 2; side++) {
 		ret[side] = NULL;
-		for (int i = 1; i < count && ret[side] == NULL; i++) {
+		for (int i = 1 + aside[side]; i < count && ret[side] == NULL; i++) {
 			const struct station *other = &stations[(at + (side == 0 ? count - i : i)) % count];
 
 			if (calibration->views[other->view].used)
@@ -171,23 +174,17 @@ static void neighbours(const struct calibration *calibration, const struct stati
 	}
 }
 
-/* Distance of a view's shadows from where its neighbours' poses have them: RMS over the balls, pixels. */
-static double stray(const struct calibration *calibration, const struct calibrate_request *request,
-		    const struct station *stations, int at)
+static const int none_aside[2] = {0};
+
+/* Distance of the balls' shadows in a view from where they would be in another: RMS, pixels. */
+static double apart(const struct calibration *calibration, const struct calibrate_request *request,
+		    const struct view *view, const struct view *other)
 {
-	const struct calibrated_view *views = calibration->views;
-	const struct station *side[2];
 	struct pose own, expected;
-	struct view view;
 	double squares = 0;
 
-	neighbours(calibration, stations, at, side);
-	if (side[0] == NULL || side[1] == NULL || side[0] == side[1] ||
-	    onward(side[0]->angle, stations[at].angle) + onward(stations[at].angle, side[1]->angle) > GAP_MOST)
-		return 0;
-	view = between(side[0], &views[side[0]->view].view, side[1], &views[side[1]->view].view, stations[at].angle);
-	pose_of_view(&own, &views[stations[at].view].view);
-	pose_of_view(&expected, &view);
+	pose_of_view(&own, view);
+	pose_of_view(&expected, other);
 	for (int b = 0; b < calibration->balls.count; b++) {
 		double is[2] = {0}, should[2] = {0};
 
@@ -196,6 +193,42 @@ static double stray(const struct calibration *calibration, const struct calibrat
 		squares += (is[0] - should[0]) * (is[0] - should[0]) + (is[1] - should[1]) * (is[1] - should[1]);
 	}
 	return sqrt(squares / calibration->balls.count);
+}
+
+/* How a view that is not used gets its pose. */
+enum filling { FILLING_NONE, FILLING_BETWEEN, FILLING_TURNED /* the nearer neighbour's, turned on */ };
+
+/*
+ * The view that a station would have were it not used, nor so many on either side: between its neighbours. Across the
+ * opening of a short scan nothing is between: the nearer end's pose is turned on. None where no other is used.
+ */
+static enum filling view_between(const struct calibration *calibration, const struct station *stations, int at,
+				 const int aside[2], struct view *ret_view)
+{
+	const struct station *side[2];
+	double to[2];
+
+	neighbours(calibration, stations, at, aside, side);
+	if (side[0] == NULL || side[1] == NULL)
+		return FILLING_NONE;
+	to[0] = onward(side[0]->angle, stations[at].angle);
+	to[1] = onward(stations[at].angle, side[1]->angle);
+	if (to[0] + to[1] > GAP_MOST)
+		side[to[0] < to[1] ? 1 : 0] = side[to[0] < to[1] ? 0 : 1];
+	*ret_view = between(side[0], &calibration->views[side[0]->view].view, side[1],
+			    &calibration->views[side[1]->view].view, stations[at].angle);
+	return side[0] == side[1] ? FILLING_TURNED : FILLING_BETWEEN;
+}
+
+/* Distance of a view's shadows from where its neighbours' poses have them: RMS over the balls, pixels. */
+static double stray(const struct calibration *calibration, const struct calibrate_request *request,
+		    const struct station *stations, int at)
+{
+	struct view view;
+
+	if (view_between(calibration, stations, at, none_aside, &view) != FILLING_BETWEEN)
+		return 0;
+	return apart(calibration, request, &calibration->views[stations[at].view].view, &view);
 }
 
 /* Refuses the view that strays most, when it strays too far; a stray view also draws its neighbours' figures up. */
@@ -245,28 +278,6 @@ int sweep_refuse(struct calibration *calibration, const struct calibrate_request
 	return code;
 }
 
-/*
- * The view that a station would have were it not used: between its neighbours. False where no other is used. Across the
- * opening of a short scan nothing is between: the nearer end's pose is turned on.
- */
-static bool view_between(const struct calibration *calibration, const struct station *stations, int at,
-			 struct view *ret_view)
-{
-	const struct station *side[2];
-	double to[2];
-
-	neighbours(calibration, stations, at, side);
-	if (side[0] == NULL || side[1] == NULL)
-		return false;
-	to[0] = onward(side[0]->angle, stations[at].angle);
-	to[1] = onward(stations[at].angle, side[1]->angle);
-	if (to[0] + to[1] > GAP_MOST)
-		side[to[0] < to[1] ? 1 : 0] = side[to[0] < to[1] ? 0 : 1];
-	*ret_view = between(side[0], &calibration->views[side[0]->view].view, side[1],
-			    &calibration->views[side[1]->view].view, stations[at].angle);
-	return true;
-}
-
 int sweep_between(const struct calibration *calibration, const struct geometry *nominal, struct view *ret_views,
 		  struct error *err)
 {
@@ -277,7 +288,7 @@ int sweep_between(const struct calibration *calibration, const struct geometry *
 	for (int i = 0; i < calibration->count; i++) {
 		struct view *view = &ret_views[stations[i].view];
 
-		if (!view_between(calibration, stations, i, view))
+		if (view_between(calibration, stations, i, none_aside, view) == FILLING_NONE)
 			*view = calibration->views[stations[i].view].view;
 	}
 	free(stations);
@@ -295,4 +306,55 @@ int sweep_fill(struct calibration *calibration, const struct geometry *nominal, 
 			calibration->views[k].view = views[k];
 	free(views);
 	return code;
+}
+
+/* The longest run of views that are not used, over the end of the list as well; of all used ones 1. */
+static int longest_run(const struct calibration *calibration, const struct station *stations)
+{
+	int longest = 1, run = 0;
+
+	for (int i = 0; i < 2 * calibration->count; i++) {
+		run = calibration->views[stations[i % calibration->count].view].used ? 0 : run + 1;
+		longest = run > longest ? run : longest;
+	}
+	return longest < calibration->count ? longest : calibration->count;
+}
+
+int sweep_error(struct calibration *calibration, const struct calibrate_request *request, struct error *err)
+{
+	struct station *stations = stations_of(request->nominal);
+	const double isocentre[3] = {0};
+	double squares[3] = {0}, squares_isocentre[3] = {0}, count[3] = {0};
+	enum filling asked = FILLING_NONE;
+	int aside[2];
+
+	if (stations == NULL)
+		return error_set(err, ERR_NO_MEMORY, "no memory for %d views", calibration->count);
+	aside[1] = longest_run(calibration, stations) - 1;
+	aside[0] = aside[1] / 2;
+	aside[1] -= aside[0];
+	for (int i = 0; i < calibration->count; i++) {
+		const struct calibrated_view *view = &calibration->views[stations[i].view];
+		struct view expected;
+		const enum filling filling =
+		    view_between(calibration, stations, i, view->used ? aside : none_aside, &expected);
+		struct pose pose;
+		double pixels, pixel[2];
+
+		if (!view->used)
+			asked = filling > asked ? filling : asked;
+		if (!view->used || filling == FILLING_NONE)
+			continue;
+		pixels = apart(calibration, request, &view->view, &expected);
+		pose_of_view(&pose, &view->view);
+		count[filling]++;
+		squares[filling] += pixels * pixels;
+		squares_isocentre[filling] += pow(pixels / pose_project(&pose, request->pixel_mm, isocentre, pixel), 2);
+	}
+	free(stations);
+	if (asked == FILLING_NONE)
+		asked = count[FILLING_BETWEEN] > 0 ? FILLING_BETWEEN : FILLING_TURNED;
+	calibration->between = sqrt(squares[asked] / fmax(1, count[asked]));
+	calibration->between_isocentre = sqrt(squares_isocentre[asked] / fmax(1, count[asked]));
+	return 0;
 }

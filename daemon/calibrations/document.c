@@ -90,18 +90,23 @@ static void add_view_warning(cJSON *warnings, const cJSON *result)
 	const cJSON *views = cJSON_GetObjectItemCaseSensitive(result, "views"), *view;
 	const int count = cJSON_GetArraySize(views), used = (int)number_of(result, "used");
 	const char *why = "";
-	char detail[320];
+	const double pixels = number_of(result, "interpolated_pixels");
+	char detail[400], off[100] = "";
 
 	if (used == count)
 		return;
+	if (pixels > 0)
+		snprintf(off, sizeof(off), ", by %.2f pixels or %.2f mm at the isocentre off as the others tell",
+			 pixels, number_of(result, "interpolated_isocentre_mm"));
 	cJSON_ArrayForEach(view, views)
 	{
 		why = text_of(view, "refused");
 		if (why[0] != '\0')
 			break;
 	}
-	snprintf(detail, sizeof(detail), "%d of %d views are not used, their places are between their neighbours': %s",
-		 count - used, count, why);
+	snprintf(detail, sizeof(detail),
+		 "%d of %d views are not used, their places are between their neighbours'%s: %s", count - used, count,
+		 off, why);
 	json_append(warnings, json_warning("calibration_views", detail));
 }
 
@@ -133,9 +138,16 @@ static void add_warnings(cJSON *document, const cJSON *result)
 
 cJSON *calibration_brief(const char *id, const cJSON *request, const cJSON *result, const struct error *failure)
 {
-	static const char *const figures[] = {"used",           "residual_pixels", "residual_isocentre_mm",
-					      "turned_deg",     "other_turn_deg",  "diameter_ratio",
-					      "distance_ratio", "balls_moved_mm"};
+	static const char *const figures[] = {"used",
+					      "residual_pixels",
+					      "residual_isocentre_mm",
+					      "turned_deg",
+					      "other_turn_deg",
+					      "diameter_ratio",
+					      "distance_ratio",
+					      "balls_moved_mm",
+					      "interpolated_pixels",
+					      "interpolated_isocentre_mm"};
 	const cJSON *balls = cJSON_GetObjectItemCaseSensitive(result, "balls_mm");
 	cJSON *document = cJSON_CreateObject();
 	char href[64];

@@ -58,6 +58,15 @@ test_what_does_not_fit_is_told_with_numbers() {
 	cbct calibrate "$work/balls" "$work/tenth.json" -o "$work/tenth.out" 2>"$work/said" || fail "$(cat "$work/said")"
 	grep -q '^caution: the shadows are 1\.[01].. times as wide' "$work/said" || fail "a caution in: $(cat "$work/said")"
 	jq -e '.distance_ratio > 1.08 and .distance_ratio < 1.12' "$work/tenth.out" >/dev/null || fail "the distances' ratio"
+	# a drawing with a ball more than the phantom, and one with a ball less
+	jq -c '.balls_mm += [[3, -2, 5, 4]] | {balls_mm}' "$work/tenth.out" >"$work/more.json"
+	jq -c '{balls_mm: .balls_mm[1:]}' "$work/tenth.out" >"$work/fewer.json"
+	cbct calibrate "$work/balls" "$work/more.json" -o /dev/null 2>"$work/said" || fail "$(cat "$work/said")"
+	grep -qE '^caution: ball 24 of the drawing \(counted from 0\) is not where the drawing has it, in [3-8] views that would show it alone' "$work/said" ||
+		fail "a ball more, in: $(cat "$work/said")"
+	cbct calibrate "$work/balls" "$work/fewer.json" -o /dev/null 2>"$work/said" || fail "$(cat "$work/said")"
+	grep -qE '^caution: [5-9] shadows of balls, in [5-8] of 8 views, are of no ball of the drawing: the drawing may have fewer balls' "$work/said" ||
+		fail "a ball less, in: $(cat "$work/said")"
 	jq -c '.balls = 10 | .distance_mm = 70' "$work/phantom.json" >"$work/wrong.json"
 	refused '8 of 8 views do not fit this phantom, and no pose could be fitted to any of them' cbct calibrate "$work/balls" "$work/wrong.json"
 	grep -qE ': the best leaves a residual of [1-9][0-9]*\.[0-9]{2} pixels over (1[0-9]|[7-9]) balls; view' "$work/said" || fail "the best residual in: $(cat "$work/said")"

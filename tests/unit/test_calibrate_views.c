@@ -139,6 +139,117 @@ START_TEST(a_pose_is_found_down_a_long_valley)
 }
 END_TEST
 
+/* Three times two pictures beside each other in which nothing is. */
+static bool in_a_gap(int view)
+{
+	return view < 30 && (view % 10 == 7 || view % 10 == 8);
+}
+
+static int take_with_a_gap(void *context, int view, float *ret_image, struct error *err)
+{
+	struct arm_scene scene = *(const struct arm_scene *)context;
+
+	if (in_a_gap(view))
+		scene.target.ball = 0;
+	return arm_image(&scene, view, ret_image, err);
+}
+
+/* Those views stand between their neighbours, and the others tell how far that is from where they stood. */
+START_TEST(what_poses_between_neighbours_are_worth_is_told)
+{
+	struct arm_scene scene = {.arm = arm_coarse};
+	struct balls balls;
+	struct calibration calibration;
+	struct error err = {0};
+	double off, pixels, squares = 0;
+
+	scene.arm.count = 40;
+	scene.arm.step = 5 * M_PI / 180;
+	scene.arm.jitter = _i == 0 ? .1 : 1;
+	ck_assert(balls_circles(&balls, &circles, &err) == 0);
+	scene.target = (struct target){.balls = &balls, .ball = .4};
+	ck_assert_msg(arm_calibrate(&scene.arm, take_with_a_gap, &scene, &balls, false, &calibration, &err) == 0, "%s",
+		      err.text);
+	ck_assert_int_eq(calibration.used, 34);
+	for (int k = 0; k < 30; k++)
+		if (in_a_gap(k))
+			squares += pow(arm_wrong(&scene.arm, k, &calibration.views[k].view), 2);
+	off = sqrt(squares / 6);
+	/* Six views say how far such views are off, but for a factor of two. */
+	ck_assert_msg(calibration.between >= .5 * off && calibration.between <= 2 * off,
+		      "told: %.3f pixels, views are off by %.3f", calibration.between, off);
+	pixels = calibration.between_isocentre / scene.arm.pixel * 1100 / 620;
+	ck_assert_double_eq_tol(pixels, calibration.between, .05 * calibration.between);
+	calibration_clear(&calibration);
+	balls_clear(&balls);
+}
+END_TEST
+
+/* What the phantom has and the drawing has not, or the other way about; `beside`: mm along x, off the picture. */
+static const struct {
+	const char *what, *told;
+	int drawn, lacks; /* index of a ball that the drawing, that the phantom has not; -1: none */
+	double beside;
+} presences[] = {
+    {"right", NULL, -1, -1, 0},
+    {"balls outside of the picture", NULL, -1, -1, 60},
+    {"a ball more in the drawing",
+     "ball 5 of the drawing (counted from 0) is not where the drawing has it, in 14 views that would show it alone: "
+     "the drawing "
+     "may have more balls than the phantom",
+     -1, 5, 0},
+    {"a ball less in the drawing",
+     "views, are of no ball of the drawing: the drawing may have fewer balls than the phantom", 5, -1, 0},
+    {"another ball in the drawing", "are of no ball of the drawing: the drawing may have other balls than the phantom",
+     14, 5, 0},
+};
+
+static void leave_out(struct balls *balls, int ball)
+{
+	if (ball >= 0)
+		balls->ball[ball] = balls->ball[--balls->count];
+}
+
+START_TEST(a_ball_more_or_less_is_told)
+{
+	struct arm_scene scene = {.arm = arm_coarse};
+	struct ball_circles few = circles;
+	struct balls balls, drawing;
+	struct calibration calibration;
+	cJSON *document, *doubts;
+	const cJSON *doubt;
+	const char *told = NULL;
+	struct error err = {0};
+
+	few.balls = 8;
+	few.shift = M_PI / 8;
+	ck_assert(balls_circles(&balls, &few, &err) == 0);
+	ck_assert(balls_circles(&drawing, &few, &err) == 0);
+	for (int b = 0; b < balls.count; b++)
+		balls.ball[b].centre[0] += presences[_i].beside;
+	leave_out(&balls, presences[_i].lacks);
+	leave_out(&drawing, presences[_i].drawn);
+	scene.target = (struct target){.balls = &balls, .ball = .4, .photons = 20000, .rays = 3};
+	ck_assert_msg(arm_calibrate(&scene.arm, arm_image, &scene, &drawing, false, &calibration, &err) == 0, "%s: %s",
+		      presences[_i].what, err.text);
+	document = calibration_json(&calibration);
+	doubts = calibration_doubts(document);
+	cJSON_ArrayForEach(doubt, doubts)
+	{
+		ck_assert_str_eq(cJSON_GetObjectItem(doubt, "code")->valuestring, "calibration_balls");
+		told = cJSON_GetObjectItem(doubt, "detail")->valuestring;
+	}
+	ck_assert_msg((told != NULL) == (presences[_i].told != NULL) &&
+			  (told == NULL || strstr(told, presences[_i].told) != NULL),
+		      "%s: %s", presences[_i].what, told != NULL ? told : "nothing told");
+	cJSON_Delete(document);
+	cJSON_Delete(doubts);
+	calibration_clear(&calibration);
+	balls_clear(&balls);
+	balls_clear(&drawing);
+}
+END_TEST
+
 Suite *calibrate_views_suite(void)
 {
 	Suite *suite = suite_create("calibrate_views");
@@ -147,6 +258,8 @@ Suite *calibrate_views_suite(void)
 	tcase_set_timeout(tests, 120);
 	tcase_add_test(tests, a_view_of_balls_in_a_plane_is_refused);
 	tcase_add_loop_test(tests, a_pose_that_fits_nearly_is_not_taken, 0, 3);
+	tcase_add_loop_test(tests, what_poses_between_neighbours_are_worth_is_told, 0, 2);
+	tcase_add_loop_test(tests, a_ball_more_or_less_is_told, 0, sizeof(presences) / sizeof(*presences));
 	tcase_add_test(tests, a_pose_is_found_down_a_long_valley);
 	suite_add_tcase(suite, tests);
 	return suite;

@@ -762,6 +762,8 @@ test('a calibration comes into the list, tells its residuals projection by proje
 	await page.click('.calibration summary:has-text("As a table")')
 	await until('the same as a table', () => page.locator('.calibration tbody tr').count(), count => count === 16)
 	expect((await page.textContent('.use')).includes(`"geometry": {"kind": "calibration", "id": "${made.id}"}`), 'how it is used')
+	const off = `Between projections${short(made.interpolated_pixels)} pixels, ${short(made.interpolated_isocentre_mm)} mm at the isocentre off`
+	expect((await page.textContent('.calibration')).includes(off), `"${off}" in: ${await page.textContent('.calibration')}`)
 	await shoot(page, 'calibration', { fullPage: true })
 
 	await page.click('button:has-text("Remove …")')
@@ -793,6 +795,17 @@ test('a calibration that is being made says so until it has ended, one that fail
 	await page.goto(`${origin}/#/calibrations`)
 	await until('why, in the list', () => page.textContent(`.calibrations li[data-id="${failed.id}"]`), text => text.includes('do not fit this phantom'))
 	await api(`/v1/calibrations/${failed.id}`, { method: 'DELETE' }).catch(() => {})
+	await page.context().close()
+})
+
+test('a drawing with a ball less than the phantom is told, in the list and of the calibration', async () => {
+	const { balls_mm: balls } = await api(`/v1/calibrations/${calibration}`), made = await calibrated('a ball less', { balls_mm: balls.slice(1) })
+	const words = [/may have more or fewer balls than the phantom/, /shadows of balls, in \d+ of 15 views, are of no ball of the drawing/]
+	const page = await open(browser, '/#/calibrations')
+	await until('in the list', () => page.textContent(`.calibrations li[data-id="${made.id}"]`), text => words[0].test(text))
+	await page.goto(`${origin}/#/calibrations/${made.id}`)
+	await until('of the calibration', () => page.textContent('.calibration'), text => words.every(word => word.test(text)))
+	await api(`/v1/calibrations/${made.id}`, { method: 'DELETE' }).catch(() => {})
 	await page.context().close()
 })
 

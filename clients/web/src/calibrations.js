@@ -222,6 +222,7 @@ export class CalibrationPage {
 			[t('Residual'), ball ? this.#summary() : null],
 			[t('Balls'), ball ? String(calibration.balls) : null],
 			[t('Projections used'), ball ? t('{n} of {all}', { n: calibration.used, all: sweep.views }) : null],
+			[t('Between projections'), ball && calibration.interpolated_pixels ? t('{px} pixels, {mm} mm at the isocentre off', { px: number(calibration.interpolated_pixels, 2), mm: number(calibration.interpolated_isocentre_mm, 2) }) : null],
 			[t('Phantom turned by'), ball ? `${number(calibration.turned_deg, 2)}°` : null],
 			[t('Shadows'), ball ? t('{n} times as wide as of the balls drawn', { n: number(calibration.diameter_ratio, 4) }) : null],
 			[t('Sources'), ball ? t('{n} times as far as the scan has them', { n: number(calibration.distance_ratio, 4) }) : null],

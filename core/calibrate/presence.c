@@ -1,0 +1,97 @@
+/*
+ * Balls of the drawing that are not there, and shadows of balls that the drawing has not. Only what stands clear tells:
+ * a ball whose shadow would be wholly on the picture and touch no other's, and a shadow that touches the place of none.
+ */
+#include <math.h>
+
+#include "core/calibrate/internal.h"
+
+static const double CLEARANCE = 2;       /* pixels between shadows that do not touch */
+static const double EDGE = 1.5;          /* radii from the picture's edge */
+static const double SIZE_UNLIKE = .4;    /* |log| of radii, by which a shadow is of no ball of the phantom's sizes */
+static const double LIKENESS_LEAST = .9; /* of a shadow that is taken for a ball's though the drawing has none there */
+
+/* Where a view has the balls. */
+struct places {
+	double place[BALLS_MOST][2], radius[BALLS_MOST];
+	double least, most; /* radii */
+};
+
+static bool on_picture(const struct geometry *nominal, const double place[2], double radius)
+{
+	const double edge = EDGE * radius;
+
+	return radius > 0 && place[0] > edge && place[1] > edge && place[0] < nominal->columns - 1 - edge &&
+	       place[1] < nominal->rows - 1 - edge;
+}
+
+/* True of a disc that touches no ball's but `own`. */
+static bool stands_clear(const struct places *places, int count, int own, const double place[2], double radius)
+{
+	for (int b = 0; b < count; b++)
+		if (b != own && places->radius[b] > 0 &&
+		    hypot(places->place[b][0] - place[0], places->place[b][1] - place[1]) <=
+			places->radius[b] + radius + CLEARANCE)
+			return false;
+	return true;
+}
+
+static void count_balls(const struct run *run, int view, const struct places *places)
+{
+	struct calibration *calibration = run->calibration;
+	const struct work *work = &run->works[view];
+	bool found[BALLS_MOST] = {false};
+
+	for (int i = 0; i < work->pair_count; i++)
+		found[work->pairs[i].ball] = true;
+	for (int b = 0; b < calibration->balls.count; b++) {
+		const double *place = places->place[b], radius = places->radius[b];
+
+		if (!found[b] && !(on_picture(run->request->nominal, place, radius) &&
+				   stands_clear(places, calibration->balls.count, b, place, radius)))
+			continue;
+		calibration->presence[b].expected++;
+		calibration->presence[b].found += found[b];
+	}
+}
+
+static int count_strays(const struct run *run, int view, const struct places *places)
+{
+	const struct work *work = &run->works[view];
+	int strays = 0;
+
+	for (int s = 0; s < work->count; s++) {
+		const struct shadow *shadow = &work->shadows[s];
+		const double place[2] = {shadow->column, shadow->row};
+
+		strays += shadow->likeness >= LIKENESS_LEAST && log(places->least / shadow->radius) <= SIZE_UNLIKE &&
+			  log(shadow->radius / places->most) <= SIZE_UNLIKE &&
+			  on_picture(run->request->nominal, place, shadow->radius) &&
+			  stands_clear(places, run->calibration->balls.count, -1, place, shadow->radius);
+	}
+	return strays;
+}
+
+void presence_count(struct run *run)
+{
+	struct calibration *calibration = run->calibration;
+
+	for (int k = 0; k < calibration->count; k++) {
+		struct places places = {.least = INFINITY};
+		int strays;
+
+		if (!calibration->views[k].used)
+			continue;
+		for (int b = 0; b < calibration->balls.count; b++) {
+			places.radius[b] = pose_shadow(&run->works[k].pose, run->request->pixel_mm,
+						       &calibration->balls.ball[b], places.place[b]);
+			if (places.radius[b] > 0)
+				places.least = fmin(places.least, places.radius[b]);
+			places.most = fmax(places.most, places.radius[b]);
+		}
+		count_balls(run, k, &places);
+		strays = count_strays(run, k, &places);
+		calibration->strays += strays;
+		calibration->stray_views += strays > 0;
+	}
+}
