@@ -456,6 +456,15 @@ static int refuse_open(const struct run *run, struct error *err)
 	return 0;
 }
 
+static int used_of(const struct calibration *calibration)
+{
+	int used = 0;
+
+	for (int k = 0; k < calibration->count; k++)
+		used += calibration->views[k].used;
+	return used;
+}
+
 /*
  * The first round begins from the nominal geometry; views that it refused begin once more, from where their neighbours
  * stand.
@@ -473,14 +482,17 @@ int find_views(struct run *run, double turn, struct error *err)
 		code = follow_refuse(calibration, run->request, turn, err);
 	if (code == 0)
 		code = refuse_uneven(run, err);
-	if (code == 0)
+	/* Each round may give other views neighbours that are nearer. */
+	for (int before = -1; code == 0 && used_of(calibration) > before;) {
+		before = used_of(calibration);
 		code = sweep_fill(calibration, run->request->nominal, err);
-	if (code == 0)
-		code = find_round(run, turn, ROUND_AGAIN, NULL, err);
-	if (code == 0)
-		code = refuse_open(run, err);
-	if (code == 0)
-		code = follow_refuse(calibration, run->request, turn, err);
+		if (code == 0)
+			code = find_round(run, turn, ROUND_AGAIN, NULL, err);
+		if (code == 0)
+			code = refuse_open(run, err);
+		if (code == 0)
+			code = follow_refuse(calibration, run->request, turn, err);
+	}
 	if (code == 0)
 		code = settle_round(run, err);
 	return code == 0 ? refuse_uneven(run, err) : code;

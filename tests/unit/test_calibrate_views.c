@@ -250,6 +250,72 @@ START_TEST(a_ball_more_or_less_is_told)
 }
 END_TEST
 
+/*
+ * Two circles near to each other that are seen edge-on, a little beside their place: a third of the shadows stands
+ * clear. Few views begin from the nominal geometry; each that does gives its neighbours a beginning, until all are
+ * found, each on its own side of the phantom, which looks the same from many.
+ */
+static const struct {
+	struct ball_circles circles;
+	int count;
+	double first;
+	unsigned seed;
+} flat[] = {
+    {{.circles = 2, .balls = 14, .diameter = 106, .distance = 19, .ball = 5.7, .shift = M_PI / 14}, 19, 3.6, 5},
+    {{.circles = 2, .balls = 14, .diameter = 106, .distance = 19, .ball = 5.7, .shift = M_PI / 14}, 19, 2.7, 4},
+    {{.circles = 2, .balls = 16, .diameter = 119.1, .distance = 21.9, .ball = 7.5, .shift = M_PI / 16}, 30, 4.12, 5},
+};
+
+static void tilt_and_shift(struct ball *ball, double tilt, const double shift[3])
+{
+	const double x = ball->centre[0], z = ball->centre[2];
+
+	ball->centre[0] = cos(tilt) * x - sin(tilt) * z + shift[0];
+	ball->centre[1] += shift[1];
+	ball->centre[2] = sin(tilt) * x + cos(tilt) * z + shift[2];
+}
+
+START_TEST(views_of_a_flat_phantom_begin_from_their_neighbours)
+{
+	struct arm_scene scene = {.arm = {.columns = 171,
+					  .rows = 145,
+					  .count = flat[_i].count,
+					  .pixel = 2.2,
+					  .first = flat[_i].first,
+					  .step = 240 * M_PI / 180 / (flat[_i].count - 1),
+					  .sag = 1.5,
+					  .jitter = .3,
+					  .seed = flat[_i].seed}};
+	const double shift[3] = {4, -3, 3};
+	struct balls balls, drawing;
+	struct calibration calibration;
+	struct error err = {0};
+
+	ck_assert(balls_circles(&drawing, &flat[_i].circles, &err) == 0);
+	ck_assert(balls_circles(&balls, &flat[_i].circles, &err) == 0);
+	for (int b = 0; b < balls.count; b++)
+		tilt_and_shift(&balls.ball[b], .02, shift);
+	scene.target = (struct target){.balls = &balls, .ball = .6, .photons = 20000, .rays = 3};
+	ck_assert_msg(arm_calibrate(&scene.arm, arm_image, &scene, &drawing, false, &calibration, &err) == 0, "%s",
+		      err.text);
+	ck_assert_int_eq(calibration.used, calibration.count);
+	for (int k = 0; k < calibration.count; k++)
+		for (int b = 0; b < balls.count; b++) {
+			const struct view truth = arm_view(&scene.arm, k);
+			double is[2], found[2];
+
+			ball_shadow(&truth, &balls.ball[b], is);
+			ball_shadow(&calibration.views[k].view, &drawing.ball[b], found);
+			ck_assert_msg(hypot(is[0] - found[0], is[1] - found[1]) <= .2,
+				      "view %d, ball %d: at %.2f %.2f, expected %.2f %.2f", k, b, found[0], found[1],
+				      is[0], is[1]);
+		}
+	calibration_clear(&calibration);
+	balls_clear(&balls);
+	balls_clear(&drawing);
+}
+END_TEST
+
 Suite *calibrate_views_suite(void)
 {
 	Suite *suite = suite_create("calibrate_views");
@@ -260,6 +326,8 @@ Suite *calibrate_views_suite(void)
 	tcase_add_loop_test(tests, a_pose_that_fits_nearly_is_not_taken, 0, 3);
 	tcase_add_loop_test(tests, what_poses_between_neighbours_are_worth_is_told, 0, 2);
 	tcase_add_loop_test(tests, a_ball_more_or_less_is_told, 0, sizeof(presences) / sizeof(*presences));
+	tcase_add_loop_test(tests, views_of_a_flat_phantom_begin_from_their_neighbours, 0,
+			    sizeof(flat) / sizeof(*flat));
 	tcase_add_test(tests, a_pose_is_found_down_a_long_valley);
 	suite_add_tcase(suite, tests);
 	return suite;
