@@ -74,6 +74,7 @@ struct maker {
 	struct process process;
 	int socket; /* -1: it has closed its end */
 	struct watchdog_signs signs;
+	double last; /* sign of life, or its start */
 	size_t steps;
 	char killed[128]; /* why, when it was for its signs; "" */
 };
@@ -97,7 +98,7 @@ static int maker_start(const struct calibrations *calibrations, const char *id, 
 	close(pair[1]);
 	if (code != 0)
 		close(pair[0]);
-	ret->signs.stepped = clock_monotonic();
+	ret->signs.stepped = ret->last = clock_monotonic();
 	ret->signs.heard = ret->signs.stepped + WATCHDOG_STEP - WATCHDOG_SILENCE;
 	return code;
 }
@@ -116,7 +117,7 @@ static void maker_hear(struct maker *maker)
 		}
 		if (code != 0 || !got)
 			return;
-		maker->signs.heard = clock_monotonic();
+		maker->signs.heard = maker->last = clock_monotonic();
 		if (message.kind == MESSAGE_ALIVE && message.steps != maker->steps)
 			maker->signs.stepped = maker->signs.heard;
 		maker->steps = message.steps;
@@ -133,7 +134,7 @@ static void maker_judge(struct maker *maker, double now)
 		return;
 	if (verdict == WATCHDOG_SILENT)
 		snprintf(maker->killed, sizeof(maker->killed), "it gave no sign of life for %.0f s and was killed",
-			 now - maker->signs.heard);
+			 now - maker->last);
 	else
 		snprintf(maker->killed, sizeof(maker->killed), "it finished no step for %.0f s and was killed",
 			 now - maker->signs.stepped);

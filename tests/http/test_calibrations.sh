@@ -510,6 +510,8 @@ test_a_process_that_gets_nowhere_is_ended() {
 	req GET "/v1/calibrations/$id?wait=60"
 	member '.state == "failed"' "$body" >/dev/null || req GET "/v1/calibrations/$id?wait=60"
 	expect_json '.ended != null and (.error.detail | test("^its process ended 3 times without a result, the last time by signal 9 .Killed.: it gave no sign of life for [0-9]+ s and was killed$"))'
+	# Its start had the patience of a step, and the words say how long it was silent, not by how much for too long.
+	expect_json '(.error.detail | capture("for (?<s>[0-9]+) s").s | tonumber) >= 13'
 	[ "$(wc -l <"$work/runs")" = 3 ] || fail "three runs, got $(wc -l <"$work/runs")"
 	echo true >"$work/how"
 	calibrated
