@@ -24,6 +24,7 @@ static const float STRAY = 0.6f;                      /* which are within this *
 static const float AGREE = 0.25f, QUIET = 0.25f, MOST_BLOCKS = 0.85f;
 static const float NOISE = 3;     /* standard deviations of a mean */
 static const float ALIKE = 0.25f; /* of the step: two steps of one band */
+static const float LEFT = 0.25f;  /* of the step, by which air may be off */
 
 /* What a view has more than the one before, and what is known of it. */
 struct change {
@@ -317,6 +318,22 @@ static void find_steps(const struct ring *ring, const struct band_step *band, fl
 	}
 }
 
+/*
+ * True if the views of a run are brighter at the detector's edge, and most show air there: what they lack, such as a
+ * table's board that is seen from its side, has left the detector for a while.
+ */
+static bool has_left(const struct ring *ring, const struct band_step *band, int place, int run, float level)
+{
+	const int edge = band->first < BETWEEN ? 0 : band->samples - 1;
+	int air = 0;
+
+	if (is_whole(band) || level >= 0 || (band->first >= BETWEEN && band->end + BETWEEN <= band->samples))
+		return false;
+	for (int k = 1; k <= run; k++)
+		air += fabsf(ring_view(ring, (place + k) % ring->count)->along[band->axis][edge]) <= -LEFT * level;
+	return 2 * air > run;
+}
+
 /* Marks the views behind a place up to another one, where they turn by no more than is wanted and are free. */
 static int mark_run(const struct ring *ring, const struct band_step *band, int place, int end, const float *steps,
 		    struct step *ret_steps)
@@ -336,6 +353,8 @@ static int mark_run(const struct ring *ring, const struct band_step *band, int p
 	step.sides[0] = ring_place(ring, place)->view;
 	step.sides[1] = ring_place(ring, (end + 1) % ring->count)->view;
 	step.level = 0.5f * (steps[place] - steps[end]);
+	if (has_left(ring, band, place, count, step.level))
+		return 0;
 	for (int k = 1; k <= count; k++)
 		ret_steps[ring_place(ring, (place + k) % ring->count)->view] = step;
 	return count;

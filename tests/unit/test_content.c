@@ -716,6 +716,50 @@ START_TEST(a_faint_object_in_every_view_is_no_air)
 }
 END_TEST
 
+/*
+ * A board that leaves a displaced detector at its edge, for four views in which it is seen from its side; pixels are
+ * means of 2 x 2 rays.
+ */
+START_TEST(a_board_that_leaves_the_detector_for_a_while_is_no_dark_part)
+{
+	enum { WIDE = 56, HIGH = 40, TURN = 67, FINE = 2 };
+	static const struct orbit_spec spec = {
+	    WIDE, HIGH, TURN, {620, 1100, {4.571, 4.571}, {-41.343, 0}, {0, 0}}, 89.115, 360. / TURN};
+	static const struct orbit_spec finer = {
+	    FINE * WIDE, FINE * HIGH, TURN, {620, 1100, {2.2855, 2.2855}, {-41.343, 0}, {0, 0}}, 89.115, 360. / TURN};
+	struct ellipsoid parts[] = {
+	    {.shape = SHAPE_ELLIPSOID,
+	     .semi_axes = {44.58, 40.12, 64.56},
+	     .centre = {-1.4, -1.94, .84},
+	     .density = 0.0192},
+	    {.shape = SHAPE_BOX, .semi_axes = {162.15, 4.33, 174.77}, .centre = {0, -72.01, 0}, .density = 0.010374},
+	};
+	const struct phantom phantom = {.count = 2, .parts = parts};
+	const struct grid grid = grid_of(16, 16, 4, 4, 4, 4);
+	struct recipe recipe = recipe_on(&grid);
+	struct outcome outcome = {0};
+	struct scene scene, rays;
+
+	scene_orbit(&scene, &spec);
+	scene_orbit(&rays, &finer);
+	scene_add(&rays, &phantom);
+	for (int i = 0; i < TURN * HIGH * WIDE; i++) {
+		double sum = 0;
+
+		for (int k = 0; k < FINE * FINE; k++)
+			sum += exp(-(double)rays.projections[(FINE * (i / WIDE) + k / FINE) * FINE * WIDE +
+							     FINE * (i % WIDE) + k % FINE]);
+		scene.projections[i] = (float)-log(sum / (FINE * FINE));
+	}
+	recipe.fdk.on = true;
+	run(&scene, &recipe, &outcome);
+	ck_assert_msg(strstr(outcome.warnings, "dark_parts: ") == NULL, "%s", outcome.warnings);
+	outcome_clear(&outcome);
+	scene_clear(&rays);
+	scene_clear(&scene);
+}
+END_TEST
+
 Suite *content_suite(void)
 {
 	Suite *suite = suite_create("content");
@@ -734,6 +778,7 @@ Suite *content_suite(void)
 	tcase_add_loop_test(tests, measured_views_all_show_something, 0, 3);
 	tcase_add_loop_test(tests, a_scan_of_air_is_told, 0, 10);
 	tcase_add_loop_test(tests, a_faint_object_in_every_view_is_no_air, 0, 8);
+	tcase_add_test(search, a_board_that_leaves_the_detector_for_a_while_is_no_dark_part);
 	suite_add_tcase(suite, search);
 	suite_add_tcase(suite, tests);
 	return suite;
