@@ -66,6 +66,11 @@ double averaging_part(double pixels)
 	return pixels > ALWAYS_MOST * (1 + 1e-9) ? 0 : fmin(1, fmax(0, (pixels - SETTLING_NONE) / 0.1));
 }
 
+double averaging_sharpness(double pixels)
+{
+	return fmin(1, fmax(0, (pixels - TOLD_FROM) / (WIDE_FROM - TOLD_FROM)));
+}
+
 double averaging_variance(double pixels, double ratio, double noise, double edges, double shells)
 {
 	/* Objects of voxels have ratios up to .137, what is blurred by tilted rows has .147 and more. */
@@ -75,14 +80,11 @@ double averaging_variance(double pixels, double ratio, double noise, double edge
 	const double fine = fmin(1, fmax(0, (wide_from - pixels) / (wide_from - TOLD_FROM)));
 	const double thin = narrow + (seen - narrow) * edges * fine;
 	const double upto = narrow_to + (TOLD_FROM - narrow_to) * edges;
+	/* Noise hides what the object is, and edges that it hides overshoot as others do. */
+	const double narrowed = ratio > 0 ? 1 : 1 - averaging_sharpness(pixels);
 	const double more = fmax(shells, fmin(1, fmax(0, (pixels - upto) / (wide_from - upto))));
 
-	return averaging_part(pixels) * told * (thin + (wide - thin) * more * fmax(0, 1 - noise / NOISY));
-}
-
-double averaging_sharpness(double pixels)
-{
-	return fmin(1, fmax(0, (pixels - TOLD_FROM) / (WIDE_FROM - TOLD_FROM)));
+	return averaging_part(pixels) * told * (thin + (wide - thin) * more * fmax(0, 1 - narrowed * noise / NOISY));
 }
 
 double averaging_model_share(double pixels, double noise)
@@ -572,8 +574,11 @@ static int widths_of_default(const struct correction_job *job, const struct stat
 
 	if (code < 0)
 		return code;
-	if (ratio > 0 && state->halves)
-		ratio = fmax(ratio, averaging_own_ratio(state->pixels[0], sums, squares.noise));
+	if (ratio > 0 && state->halves) {
+		const double own = averaging_own_ratio(state->pixels[0], sums, squares.noise);
+
+		ratio = own > 0 ? fmax(ratio, own) : 0;
+	}
 	/* Of white noise a second difference has six times the variance. */
 	noise = squares.noise > 0 ? 6 * squares.noise / (6 * squares.noise + shown) : 0;
 	for (int i = 0; i < 2; i++)

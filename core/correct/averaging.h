@@ -61,8 +61,9 @@ struct averaging_mean averaging_mean(const struct recipe *recipe);
  * which they can from 2 pixels a voxel on. It is known by its variance, the smaller the less voxels would overshoot.
  * TV takes out what noise is, and with a wide mean what little of the object stands above it.
  *
- * Its variance in voxels' squares, that of both passes together. ratio: averaging_ratio, 0 where it is not known, or
- * averaging_own_ratio where that is more;
+ * Its variance in voxels' squares, that of both passes together. ratio: averaging_ratio, or averaging_own_ratio where
+ * that is more; 0 where either is hidden by noise, since rows of a body whose outline is tilted everywhere look as
+ * those of voxels beside each other: then the mean is taken, and from 2.2 pixels a voxel on as wide as without noise;
  * noise: the share of the power of second differences that is noise, 0 .. 1; edges: settling_share, where neighbouring
  * pixels show edges that are not tilted, the mean is narrower up to 2 pixels a voxel; shells: shells_share, where bone
  * is thinner than voxels can hold it is as wide as with finer pixels. 0: no mean.
