@@ -308,7 +308,8 @@ static int foretell(const struct metal *metal, const struct metal_tools *tools, 
 			code = tools->backend->stack_download(tools->projections, batch.first, batch.count, batch.views,
 							      err);
 		memset(errors, 0, most * sizeof(float));
-		for (int i = 0; i < batch.count && code == 0; i++) {
+#pragma omp parallel for schedule(dynamic)
+		for (int i = 0; i < (code == 0 ? batch.count : 0); i++) {
 			const int view = batch.first + i;
 			const float *shadow = batch.shadow + (size_t)i * pixels;
 			const struct metal_view of = {
@@ -476,6 +477,32 @@ static void find_low(const struct metal_doubt *doubt, const struct metal_tools *
 		ret_low[i] = doubt->there[i] > 0 ? ret_low[i] / doubt->there[i] : 0;
 }
 
+/* Sums of squares over the voxels of each cell, [band][cell], and how many they are. */
+static void add_squares(const struct metal_doubt *doubt, const struct grid *grid, const float *values, float *cells,
+			float *counts)
+{
+	const size_t nx = (size_t)grid->size[0], slice = metal_slice_voxels(grid), all = cells_of(doubt);
+
+	/* A layer's cells are those of its slices alone. */
+#pragma omp parallel for schedule(static)
+	for (int layer = 0; layer < doubt->cells[2]; layer++) {
+		const size_t size = (size_t)doubt->cell[2] * slice, from = (size_t)layer * size;
+
+		for (size_t i = from; i < from + size && i < grid_voxels(grid); i++) {
+			const size_t x = i % nx / (size_t)doubt->cell[0], y = i % slice / nx / (size_t)doubt->cell[1];
+			const size_t line = (size_t)layer * (size_t)doubt->cells[1] + y;
+			const size_t cell = line * (size_t)doubt->cells[0] + x;
+			const float low = doubt->low[i], high = values[i] - low;
+
+			if (doubt->hidden[i])
+				continue;
+			cells[METAL_LOW * all + cell] += low * low;
+			cells[METAL_HIGH * all + cell] += high * high;
+			counts[cell]++;
+		}
+	}
+}
+
 /*
  * Adds to each cell the mean of the squares of a volume, or of its difference to the first one, in it and those around
  * it, of each band that is asked for. `low` has its lower band then.
@@ -484,7 +511,7 @@ static int square_cells(const struct metal_doubt *doubt, const struct metal_tool
 			bool from_first, float *const ret_cells[METAL_BANDS], struct error *err)
 {
 	const struct grid *grid = tools->grid;
-	const size_t slice = metal_slice_voxels(grid), nx = (size_t)grid->size[0], all = cells_of(doubt);
+	const size_t all = cells_of(doubt);
 	const int once[3] = {1, 1, 1};
 	float *values = malloc(grid_voxels(grid) * sizeof(float)),
 	      *cells = calloc((METAL_BANDS + 1) * all, sizeof(float));
@@ -495,21 +522,12 @@ static int square_cells(const struct metal_doubt *doubt, const struct metal_tool
 		code = error_set(err, ERR_NO_MEMORY, "no memory for a volume of %zu voxels", grid_voxels(grid));
 	if (code == 0)
 		code = tools->backend->volume_download(volume, 0, grid->size[2], values, err);
-	for (size_t i = 0; i < grid_voxels(grid) && code == 0 && from_first; i++)
+#pragma omp parallel for schedule(static)
+	for (size_t i = 0; i < (code == 0 && from_first ? grid_voxels(grid) : 0); i++)
 		values[i] -= doubt->first[i];
-	if (code == 0)
+	if (code == 0) {
 		find_low(doubt, tools, values, doubt->low);
-	for (size_t i = 0; i < grid_voxels(grid) && code == 0; i++) {
-		const size_t x = i % nx, y = i % slice / nx, z = i / slice;
-		const size_t line = z / (size_t)doubt->cell[2] * (size_t)doubt->cells[1] + y / (size_t)doubt->cell[1];
-		const size_t cell = line * (size_t)doubt->cells[0] + x / (size_t)doubt->cell[0];
-		const float low = doubt->low[i], high = values[i] - low;
-
-		if (doubt->hidden[i])
-			continue;
-		cells[METAL_LOW * all + cell] += low * low;
-		cells[METAL_HIGH * all + cell] += high * high;
-		counts[cell]++;
+		add_squares(doubt, grid, values, cells, counts);
 	}
 	if (code == 0)
 		smooth(counts, doubt->cells, once);
