@@ -150,7 +150,7 @@ static void hold_run(struct calibration *calibration, struct stance *stances, in
 		view->used = false;
 		snprintf(view->refused, sizeof(view->refused),
 			 "its source and detector do not follow those of the %d views that follow each other, of %d: "
-			 "expected within %.0f and %.0f degrees of the view before, and %.0f mm",
+			 "expected within %.0f and %.0f degrees of the view before, and some %.0f mm of its height",
 			 runs[longest].count, count, LEAP_MOST * 180 / M_PI, TWIST_MOST * 180 / M_PI, SLIP_MOST);
 	}
 }

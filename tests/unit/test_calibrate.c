@@ -507,6 +507,16 @@ static void look_from_elsewhere(struct view *view, double turn, bool over, doubl
 	}
 }
 
+/* The arm's nominal geometry, and its views as they are, all used. */
+static void use_views(const struct arm *arm, struct geometry *ret_nominal, struct calibrated_view *ret_views)
+{
+	struct error err = {0};
+
+	ck_assert_msg(arm_nominal_geometry(arm, ret_nominal, &err) == 0, "%s", err.text);
+	for (int k = 0; k < arm->count; k++)
+		ret_views[k] = (struct calibrated_view){.view = arm_view(arm, k), .used = true};
+}
+
 /*
  * Two circles of 16 balls, each between two of the other's, look the same half a turn about lines between them, and a
  * ball further on. Views that have no residual there are refused, alone, before or after the first and side by side,
@@ -538,9 +548,7 @@ START_TEST(a_view_from_another_side_of_the_phantom_is_refused)
 	bool refused[VIEWS] = {false};
 	struct error err = {0};
 
-	ck_assert_msg(arm_nominal_geometry(&arm, &nominal, &err) == 0, "%s", err.text);
-	for (int k = 0; k < VIEWS; k++)
-		views[k] = (struct calibrated_view){.view = arm_view(&arm, k), .used = true};
+	use_views(&arm, &nominal, views);
 	for (size_t i = 0; i < sizeof(elsewhere) / sizeof(*elsewhere); i++) {
 		struct view *view = &views[elsewhere[i].view].view;
 
@@ -578,9 +586,7 @@ START_TEST(a_view_that_is_a_circle_aside_is_refused)
 	bool refused[VIEWS] = {false};
 	struct error err = {0};
 
-	ck_assert_msg(arm_nominal_geometry(&arm, &nominal, &err) == 0, "%s", err.text);
-	for (int k = 0; k < VIEWS; k++)
-		views[k] = (struct calibrated_view){.view = arm_view(&arm, k), .used = true};
+	use_views(&arm, &nominal, views);
 	for (size_t i = 0; i < sizeof(slipped) / sizeof(*slipped); i++) {
 		struct view *view = &views[slipped[i]].view;
 
@@ -615,11 +621,9 @@ START_TEST(the_ends_of_a_short_sweep_follow_no_view)
 	const struct calibrate_request request = {.nominal = &nominal, .pixel_mm = pixel_mm};
 	struct error err = {0};
 
-	ck_assert_msg(arm_nominal_geometry(&arm, &nominal, &err) == 0, "%s", err.text);
-	for (int k = 0; k < VIEWS; k++) {
-		views[k] = (struct calibrated_view){.view = arm_view(&arm, k), .used = true};
+	use_views(&arm, &nominal, views);
+	for (int k = 0; k < VIEWS; k++)
 		look_from_elsewhere(&views[k].view, (k - VIEWS / 2) * .5 * M_PI / 180, false, 0);
-	}
 	ck_assert_msg(follow_refuse(&calibration, &request, 0, &err) == 0, "%s", err.text);
 	for (int k = 0; k < VIEWS; k++)
 		ck_assert_msg(views[k].used, "view %d: %s", k, views[k].refused);
