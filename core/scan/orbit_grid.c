@@ -188,6 +188,48 @@ static void box_of_range(const struct orbit *orbit, double radius, const double 
 	}
 }
 
+/* Where the detector's middle row is on the orbit's axis, mm along it, in the mean of all views; NAN where it is not.
+ */
+static double middle_row_on_axis(const struct orbit *orbit, const struct geometry *geometry)
+{
+	const double row = 0.5 * (geometry->rows - 1);
+	double sum = 0;
+
+	for (int k = 0; k < geometry->count; k++) {
+		const struct view view = orbit_view(orbit, &geometry->views[k]);
+		double matrix[12], slope;
+
+		view_matrix(&view, matrix);
+		slope = matrix[6] - row * matrix[10];
+		if (fabs(slope) < 1e-9 * fabs(matrix[6]) + 1e-300)
+			return NAN;
+		sum += (row * matrix[11] - matrix[7]) / slope;
+	}
+	return sum / geometry->count;
+}
+
+/*
+ * Slices across z of [low, high], their outermost centres inside of it, which lie where rows meet the axis. With voxels
+ * of a pixel and slices between two rows, the rays near the middle plane are the means of both slices beside them. What
+ * alternates from slice to slice is then in no projection, and what little less than alternates is in them so weakly
+ * that iterations raise it without end: slices of 1190, 876, 1132 HU in a flat cylinder of 1020
+ * (tests/bench/results/denoise.txt).
+ */
+static void lay_slices_on_rows(const struct orbit *orbit, const struct geometry *geometry, double low, double high,
+			       struct grid *grid)
+{
+	const double spacing = grid->spacing[2], rounding = 1e-6;
+	const double row = middle_row_on_axis(orbit, geometry) * orbit->frame[2][2];
+	const double slice = row + (geometry->rows % 2 ? 0 : 0.5 * spacing);
+	const double first = ceil((low - slice) / spacing - rounding),
+		     last = floor((high - slice) / spacing + rounding);
+
+	if (!(last >= first && last - first < grid->size[2]))
+		return;
+	grid->size[2] = (int)(last - first) + 1;
+	grid->origin[2] = slice + first * spacing;
+}
+
 void orbit_default_grid(const struct orbit *orbit, const struct geometry *given, int most, struct grid *ret_grid)
 {
 	const struct geometry sides_of = orbit_sides(orbit, given), *geometry = &sides_of;
@@ -217,6 +259,7 @@ void orbit_default_grid(const struct orbit *orbit, const struct geometry *given,
 		grid.spacing[i] = spacing;
 		grid.origin[i] = 0.5 * (low[i] + high[i]) - 0.5 * (grid.size[i] - 1) * spacing;
 	}
+	lay_slices_on_rows(orbit, geometry, low[2], high[2], &grid);
 	if (grid_check_geometry(&grid, given, &err) == 0)
 		*ret_grid = grid;
 }

@@ -967,6 +967,39 @@ START_TEST(a_default_grid_exists_for_any_orbit)
 }
 END_TEST
 
+/*
+ * Of voxels of a pixel the slices lie where rows meet the axis: an odd count of rows, an even one, and detectors that
+ * are moved up by a part of a row. By the matrices alone.
+ */
+START_TEST(slices_of_a_default_grid_lie_on_rows)
+{
+	static const struct sweep sweeps[] = {
+	    {48, 25, 5.77, 0, 6, 60, {0, 0}, 0},      {48, 24, 5.77, 0, 6, 60, {0, 0}, 0},
+	    {64, 37, 2, 0, 6, 60, {0, .7}, 0},        {64, 36, 2, 0, 6, 60, {0, -1.2}, 0},
+	    {160, 100, 2, 40, -1.8, 115, {0, .5}, 0}, {160, 101, 2, 0, 1.5, 240, {-90, 25.3}, 0},
+	};
+
+	for (size_t i = 0; i < sizeof(sweeps) / sizeof(*sweeps); i++) {
+		struct geometry geometry = geometry_of(&sweeps[i], NULL);
+		struct orbit orbit = orbit_of(&geometry);
+		struct grid grid;
+
+		orbit_default_grid(&orbit, &geometry, 1024, &grid);
+		ck_assert_int_gt(grid.size[2], 8);
+		for (int slice = 0; slice < grid.size[2]; slice++) {
+			const double place[3] = {0, 0, grid.origin[2] + slice * grid.spacing[2]};
+			double matrix[12], column, row;
+
+			view_matrix(&geometry.views[i % 3], matrix);
+			view_project(matrix, place, &column, &row);
+			ck_assert_msg(fabs(row - round(row)) < .02, "sweep %zu: slice %d on row %g", i, slice, row);
+		}
+		orbit_clear(&orbit);
+		geometry_clear(&geometry);
+	}
+}
+END_TEST
+
 /* Opposite views look along one direction, however many they are; so do those beside each other. */
 START_TEST(directions_are_counted_without_their_opposites)
 {
@@ -1115,6 +1148,7 @@ Suite *orbit_suite(void)
 	tcase_add_test(grids, a_default_grid_covers_what_is_seen_and_no_more);
 	tcase_add_loop_test(grids, every_slice_of_a_default_grid_is_seen_by_all_views, 0, 6);
 	tcase_add_test(grids, a_default_grid_exists_for_any_orbit);
+	tcase_add_test(grids, slices_of_a_default_grid_lie_on_rows);
 	suite_add_tcase(suite, grids);
 	return suite;
 }
