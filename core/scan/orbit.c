@@ -20,7 +20,11 @@ static const double SWEEP_GAP = 40 * M_PI / 180, HOLE = 20 * M_PI / 180;
 static const double ODD_GAP_RATIO = 3;
 static const double LEAN_LEAST = 4 * M_PI / 180; /* FDK about z is within 4 HU up to there; real arms lean by less */
 static const double SAME_ANGLE = 1e-6;           /* radians, a micrometre on a C-arm's orbit */
-static const double DISPLACED_PIXELS = 4, DISPLACED_WIDTH = 0.02;
+/*
+ * Without weights the ring between the near edge and the far one is at half its density, and it is as wide as the
+ * displacement, in shares of the width, whatever the pixels; half a pixel is no column more on one side.
+ */
+static const double DISPLACED_PIXELS = 0.5, DISPLACED_WIDTH = 0.02;
 
 struct view orbit_view(const struct orbit *orbit, const struct view *view)
 {

@@ -52,7 +52,7 @@ struct orbit {
 	double source_to_detector; /* mm, mean, along the normal */
 	double field_of_view;      /* mm, diameter of the cylinder that all views see, or one half when displaced */
 	double displacement;       /* mm at the detector, along +u, of its centre from the ray through the axis, mean */
-	bool displaced; /* half-fan weights: full turn, displaced by more than 4 pixels and 2 % of the width */
+	bool displaced; /* half-fan weights: full turn, displaced by more than 2 % of the width and half a pixel */
 	/*
 	 * Columns that FDK adds before column 0 and behind the last one, zero before
 	 * the filter, when displaced; else 0. The filtered row has tails there, and

@@ -323,10 +323,10 @@ START_TEST(only_a_clear_displacement_on_a_full_turn_counts)
 		int views; /* a degree apart */
 		bool displaced;
 	} rows[] = {
-	    {559, 0.4, 0, 360, false},  {559, 8.8, 0, 360, false}, {559, 9.2, 0, 360, true}, {559, -120, 0, 360, true},
-	    {559, 120, 0, 221, false},  {559, 120, 0, 350, true},  {559, 3, 0, 221, false},  {64, 3, 0, 360, false},
-	    {64, 3.4, 0, 360, true},    {559, 500, 0, 360, true},  {559, 0, 10, 360, false}, {559, 0, 30, 360, true},
-	    {559, 24, -31, 360, false},
+	    {559, 0.4, 0, 360, false}, {559, 8.8, 0, 360, false}, {559, 9.2, 0, 360, true},   {559, -120, 0, 360, true},
+	    {559, 120, 0, 221, false}, {559, 120, 0, 350, true},  {559, 3, 0, 221, false},    {64, 1, 0, 360, false},
+	    {64, 1.1, 0, 360, true},   {16, 0.38, 0, 360, false}, {16, 0.42, 0, 360, true},   {559, 500, 0, 360, true},
+	    {559, 0, 10, 360, false},  {559, 0, 30, 360, true},   {559, 24, -31, 360, false},
 	};
 
 	for (size_t i = 0; i < sizeof(rows) / sizeof(*rows); i++) {

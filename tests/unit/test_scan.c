@@ -411,6 +411,9 @@ static const struct {
     {"3.6", "4", 360, "counter-clockwise", "full", "none", "duplicate_angles "}, /* 400 degrees in all */
     {"\"detector_offset_mm\": [0", "\"detector_offset_mm\": [150", 360, "counter-clockwise", "full", "displaced",
      "displaced_detector "},
+    /* 4 of 64 columns */
+    {"\"columns\": 559, \"rows\": 559, \"pixel_mm\": [0.8, 0.8]", "\"columns\": 64, \"rows\": 64, \"pixel_mm\": [7, 7]",
+     360, "counter-clockwise", "full", "none", ""},
     {"\"count\": 100", "\"count\": 2", 3.6, "counter-clockwise", "short", "parker",
      "arc_too_short parker_weights few_views "},
     {"\"count\": 100", "\"count\": 1", 0, "none", "single view", "none", "single_view "},
