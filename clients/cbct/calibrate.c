@@ -209,13 +209,14 @@ static int calibrate_run(const void *values, struct error *err)
 
 		if (document == NULL)
 			code = error_set(err, ERR_NO_MEMORY, "no memory for a calibration's document");
-		else
-			result_say(&calibration, document);
 		if (code == 0)
 			code = result_write(options, document, err);
-		cJSON_Delete(document);
 		if (code == 0 && options->apply != NULL)
 			code = apply(options, &calibration, files.scan, err);
+		/* Whoever reads may have left: what is written is written by then. */
+		if (document != NULL)
+			result_say(&calibration, document);
+		cJSON_Delete(document);
 		calibration_clear(&calibration);
 	}
 	scan_files_close(&files);

@@ -32,6 +32,10 @@ test_a_head_is_as_good_as_with_the_true_matrices() {
 		(.views | all(.used and .refused == null and .balls >= 12))' "$work/calibration.json" >/dev/null ||
 		fail "a calibration's document: $(head -c 600 "$work/calibration.json")"
 
+	# whoever reads what it says may leave: the file is written all the same
+	cbct calibrate "$work/balls" "$work/phantom.json" -o "$work/unread.json" 2>&1 | true || :
+	cmp "$work/calibration.json" "$work/unread.json" || fail "the file of a calibration that nobody reads"
+
 	cbct simulate -o "$work/head" "${arm[@]}" "${head[@]}" --truth "$work/truth.nii" --grid 80 --spacing 2
 	cbct simulate -o "$work/true" "${arm[@]}" "${head[@]}" --kind matrices
 	cp -r "$work/head" "$work/nominal"
