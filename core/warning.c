@@ -54,6 +54,8 @@ const struct warning_kind warning_kinds[] = {
     /* ---- of a calibration, and of a scan that uses one ---- */
     {"calibration_balls", SEVERITY_CAUTION,
      "The drawing of the phantom that the arm was calibrated with may have more or fewer balls than the phantom."},
+    {"calibration_height", SEVERITY_CAUTION,
+     "The phantom looks the same higher or lower along the arm's axis: images may be shifted along it by that much."},
     {"calibration_interpolated", SEVERITY_INFO,
      "The arm's places in this scan are interpolated between those that were calibrated."},
     {"calibration_old", SEVERITY_CAUTION,

@@ -354,6 +354,10 @@ cJSON *calibration_json(const struct calibration *calibration)
 		cJSON_AddNumberToObject(json, "other_turn_deg", calibration->rival_turn / degree);
 	else
 		cJSON_AddNullToObject(json, "other_turn_deg");
+	if (calibration->rival_height != 0)
+		cJSON_AddNumberToObject(json, "other_height_mm", calibration->rival_height);
+	else
+		cJSON_AddNullToObject(json, "other_height_mm");
 	cJSON_AddNumberToObject(json, "diameter_ratio", calibration->diameter_ratio);
 	cJSON_AddNumberToObject(json, "diameter_error", calibration->diameter_error);
 	cJSON_AddNumberToObject(json, "distance_ratio", calibration->distance_ratio);
@@ -466,6 +470,21 @@ static void doubt_balls(const cJSON *json, cJSON *doubts)
 	add_doubt(doubts, "calibration_balls", detail);
 }
 
+/* Of like circles one above the other those in the pictures may be the next ones. */
+static void doubt_height(const cJSON *json, cJSON *doubts)
+{
+	const double further = number_of(json, "other_height_mm", 0);
+	char detail[240];
+
+	if (further == 0)
+		return;
+	snprintf(detail, sizeof(detail),
+		 "the pictures are explained as well by the phantom %.1f mm %s: which of the two is not known, and the "
+		 "one nearer to the nominal geometry was taken",
+		 fabs(further), further > 0 ? "higher along z" : "lower along z");
+	add_doubt(doubts, "calibration_height", detail);
+}
+
 /*
  * The poses of a drawing of another scale are those of the same arm in that scale, with the same residual: only the
  * balls' diameters and the nominal distances know of it. A drawing of another shape leaves a residual.
@@ -505,5 +524,6 @@ cJSON *calibration_doubts(const cJSON *json)
 		add_doubt(doubts, "calibration_shape", detail);
 	}
 	doubt_balls(json, doubts);
+	doubt_height(json, doubts);
 	return doubts;
 }

@@ -349,6 +349,8 @@ static int run_open(struct run *run, struct calibration *calibration, const stru
 		run->least = fmin(run->least, request->balls->ball[b].diameter);
 		run->most = fmax(run->most, request->balls->ball[b].diameter);
 	}
+	if (motions_of(request->balls, &run->motions, err) < 0)
+		return err->code;
 	return balls_copy(&calibration->balls, request->balls->ball, request->balls->count, err);
 }
 
@@ -388,8 +390,7 @@ int calibrate(struct calibration *ret_calibration, const struct calibrate_reques
 		code = check_pictures(&run, err);
 	if (code == 0) {
 		prepare_matches(&run);
-		code = match_turn(run.matches, calibration.count, request->pixel_mm, request->balls, &turn,
-				  &calibration.rival_turn, err);
+		code = match_turn(run.matches, calibration.count, request->pixel_mm, request->balls, &turn, err);
 	}
 	if (code == 0)
 		code = find_views(&run, turn, err);

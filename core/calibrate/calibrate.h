@@ -19,6 +19,8 @@
  *   bundle.c   all views and the balls' own places at once, where that is asked for
  *   diameters.c  the balls' diameters against the drawing's
  *   presence.c  balls that were never seen, shadows that are of none
+ *   motions.c  places at which a phantom looks the same
+ *   placing.c  which of these is each view's, and that of all
  *   follow.c   views that look the same from another side
  *   sweep.c    views that do not follow their neighbours; poses between calibrated ones
  *
@@ -113,10 +115,11 @@ struct calibration {
 	double rms, rms_isocentre;      /* pixels, mm: over all shadows used */
 	double turn;                    /* radians about z by which the phantom stood turned against its drawing */
 	/*
-	 * Radians, of a few degrees' resolution, by which the phantom could as well stand turned further: balls of one
-	 * size at equal steps look the same. The turn nearest to the nominal geometry was taken. 0: no other turn fits.
+	 * By how much the phantom could as well stand turned further, radians, or further along z, mm: balls of one
+	 * size at equal steps look the same, and so do like circles where not all are in the picture. The place nearest
+	 * to the nominal geometry was taken. 0: no other fits.
 	 */
-	double rival_turn;
+	double rival_turn, rival_height;
 	double diameter_ratio; /* median of shadow's to expected diameter */
 	double diameter_error; /* of this ratio: what noise and blur leave open */
 	double explained;      /* mm at the isocentre, of rms_isocentre, that noise and centring may make up */

@@ -16,14 +16,9 @@ static const double LEAP_MOST = 5 * M_PI / 180;     /* of a source, against the 
 /* Of a detector: balls near to a plane tell little of its turns, and less where one is not where it is drawn. */
 static const double TWIST_MOST = 45 * M_PI / 180;
 
-/* mm, of the origin's image along the axis, against the view before; or .6 for each degree between. */
-static const double SLIP_MOST = 8, SLIP_TURN = .6 * 180 / M_PI;
-
 /* A view's pose as the arm has it: turned back by its nominal source's angle. */
 struct stance {
 	struct pose pose;
-	double angle;  /* radians, of its nominal source */
-	double height; /* of where the world's origin has its image, mm there along the axis of the turn */
 	int view, run; /* run: which the view goes on with */
 };
 
@@ -39,26 +34,6 @@ static double angle_between(const double a[3], const double b[3])
 
 	vec_cross(a, b, across);
 	return atan2(vec_norm(across), vec_dot(a, b));
-}
-
-static double height_of(const struct pose *pose)
-{
-	const double distance = -vec_dot(pose->axes[2], pose->source);
-	double height = 0;
-
-	for (int i = 0; i < 2; i++)
-		height -= (vec_dot(pose->axes[i], pose->source) + distance * pose->detector[i] / pose->detector[2]) *
-			  pose->axes[i][2];
-	return height;
-}
-
-/* By how much a view stands higher or lower than the one before; INFINITY: by more than an arm moves. */
-static double slip(const struct stance *last, const struct stance *next)
-{
-	const double turn = fabs(remainder(next->angle - last->angle, 2 * M_PI));
-	const double height = fabs(next->height - last->height);
-
-	return height > fmax(SLIP_MOST, SLIP_TURN * turn) ? INFINITY : height;
 }
 
 /* By which angle a turn has one's axes stand as the other's. */
@@ -105,26 +80,18 @@ static void hold_nominal(const struct pose *found, const struct pose *nominal, c
 			 source, detector);
 }
 
-/*
- * Puts a view to the run that it goes on with, or begins one: of those so far, of those as high where there are any,
- * the one that has most views.
- */
+/* Puts a view to the run that it goes on with, or begins one: of those so far, the one that has most views. */
 static void go_on(struct stance *stance, struct follow *runs, int *count)
 {
 	int own = *count;
-	bool level = false;
 
 	for (int r = 0; r < *count; r++) {
 		const struct pose *last = &runs[r].last->pose;
-		const double aside = slip(runs[r].last, stance);
-		const bool as_high = aside <= SLIP_MOST;
 
-		if (aside < INFINITY && angle_between(last->source, stance->pose.source) <= LEAP_MOST &&
-		    twist_between(last, &stance->pose) <= TWIST_MOST && as_high >= level &&
-		    (own == *count || as_high > level || runs[r].count > runs[own].count)) {
+		if (angle_between(last->source, stance->pose.source) <= LEAP_MOST &&
+		    twist_between(last, &stance->pose) <= TWIST_MOST &&
+		    (own == *count || runs[r].count > runs[own].count))
 			own = r;
-			level = as_high;
-		}
 	}
 	if (own == *count)
 		runs[(*count)++] = (struct follow){0};
@@ -150,28 +117,9 @@ static void hold_run(struct calibration *calibration, struct stance *stances, in
 		view->used = false;
 		snprintf(view->refused, sizeof(view->refused),
 			 "its source and detector do not follow those of the %d views that follow each other, of %d: "
-			 "expected within %.0f and %.0f degrees of the view before, and some %.0f mm of its height",
-			 runs[longest].count, count, LEAP_MOST * 180 / M_PI, TWIST_MOST * 180 / M_PI, SLIP_MOST);
+			 "expected within %.0f and %.0f degrees of the view before",
+			 runs[longest].count, count, LEAP_MOST * 180 / M_PI, TWIST_MOST * 180 / M_PI);
 	}
-}
-
-/* Where the sweep begins among its stations: behind its widest gap, the opening of a short scan, over which none
- * follows. */
-static int first_station(const struct station *stations, int count)
-{
-	double widest = -1;
-	int first = 0;
-
-	for (int i = 0; i < count; i++) {
-		const double gap = remainder(stations[i].angle - stations[(i + count - 1) % count].angle, 2 * M_PI);
-		const double onward = gap < 0 ? gap + 2 * M_PI : gap;
-
-		if (onward > widest + 1e-9) {
-			widest = onward;
-			first = i;
-		}
-	}
-	return first;
 }
 
 int follow_refuse(struct calibration *calibration, const struct calibrate_request *request, double turn,
@@ -192,14 +140,13 @@ int follow_refuse(struct calibration *calibration, const struct calibrate_reques
 
 		if (!view->used)
 			continue;
-		stances[count] = (struct stance){.view = k, .angle = stations[i].angle};
+		stances[count] = (struct stance){.view = k};
 		pose_of_view(&stances[count].pose, &view->view);
 		pose_of_view(&nominal, &request->nominal->views[k]);
 		pose_turn(&nominal, -turn); /* the phantom turned one way is the arm turned the other */
 		hold_nominal(&stances[count].pose, &nominal, view->refused, sizeof(view->refused));
 		view->used = view->refused[0] == '\0';
 		pose_turn(&stances[count].pose, -stations[i].angle);
-		stances[count].height = height_of(&stances[count].pose);
 		count += view->used;
 	}
 	if (code == 0 && count > 0)

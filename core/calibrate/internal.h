@@ -129,11 +129,10 @@ int match_pose(const struct match_view *view, const struct pose *pose, const dou
 	       const struct balls *balls, double reach, struct pair *ret_pairs);
 /*
  * The angle about z by which the phantom stood turned: of those under which about as many balls of some views have
- * shadows as under any, the smallest. A phantom that looks the same a ball further on is taken to stand as the nominal
- * geometry has it; *ret_rival is then how much further it looks the same, 0 for any other.
+ * shadows as under any, the smallest.
  */
 int match_turn(const struct match_view *views, int count, const double pixel_mm[2], const struct balls *balls,
-	       double *ret_turn, double *ret_rival, struct error *err);
+	       double *ret_turn, struct error *err);
 
 /* ---- touching.c ---- */
 /*
@@ -143,6 +142,26 @@ int match_turn(const struct match_view *views, int count, const double pixel_mm[
  */
 int touching_fit(const struct match_view *view, const float *image, const struct pose *pose, const double pixel_mm[2],
 		 const struct balls *balls, struct pair *ret_pairs);
+
+/* ---- motions.c ---- */
+enum { MOTIONS_MOST = 48 };
+
+/* A turn about z, radians, and a way along it, mm, under which many of a phantom's balls are others of them. */
+struct motion {
+	double turn, along;
+	double way; /* mm, of a ball, RMS */
+	bool whole; /* all balls are others then: nothing in a picture tells of it */
+};
+
+/* The first is none at all; then by their ways. */
+struct motions {
+	struct motion motion[MOTIONS_MOST];
+	int count;
+};
+
+int motions_of(const struct balls *balls, struct motions *ret_motions, struct error *err);
+/* A view's pose that sees the same of the phantom, each ball in the place of the one that the motion moves there. */
+void pose_move(struct pose *pose, const struct motion *motion);
 
 /* ---- bundle.c ---- */
 struct bundle_view {
@@ -174,11 +193,14 @@ struct run {
 	struct calibration *calibration;
 	struct work *works;         /* [views] */
 	struct match_view *matches; /* [views] */
+	struct motions motions;     /* of the drawing */
 	double least, most;         /* mm, the balls' diameters */
 };
 
 /* Pose and pairs of each view that can be used, the phantom turned about z by an angle; of the others the reason. */
 int find_views(struct run *run, double turn, struct error *err);
+/* Finds views anew that are used, each from a pose of `poses`, of which those with `moved` are. */
+int find_moved(const struct run *run, const struct pose *poses, const bool *moved, struct error *err);
 /* Residuals of a view that has its pose and pairs. */
 void measure_view(const struct run *run, int view);
 
@@ -195,6 +217,11 @@ int diameters_measure(const struct run *run, struct diameters *ret, struct error
 /* ---- presence.c ---- */
 /* Writes calibration->presence, strays and stray_views, by the views that are used. */
 void presence_count(struct run *run);
+/*
+ * What a view shows that a pose does not explain: balls of which nothing is where they should stand clear on the
+ * picture, and shadows that are of none.
+ */
+int presence_unexplained(const struct run *run, int view, const struct pose *pose);
 
 /* ---- sweep.c ---- */
 /* A view's place in the order of the angles. */
@@ -204,6 +231,10 @@ struct station {
 };
 /* All views in that order, the caller's to free; NULL: no memory. */
 struct station *stations_of(const struct geometry *nominal);
+/* Where the sweep begins among its stations: behind its widest gap, the opening of a short scan. */
+int first_station(const struct station *stations, int count);
+/* Distance of the balls' shadows under one pose from where they are under another: RMS, pixels. */
+double poses_apart(const struct balls *balls, const double pixel_mm[2], const struct pose *a, const struct pose *b);
 /* Turns source and detector about z. */
 void pose_turn(struct pose *pose, double angle);
 /*
@@ -218,6 +249,13 @@ int sweep_between(const struct calibration *calibration, const struct geometry *
 int sweep_fill(struct calibration *calibration, const struct geometry *nominal, struct error *err);
 /* What poses between neighbours are worth, by those that are used: calibration->between and between_isocentre. */
 int sweep_error(struct calibration *calibration, const struct calibrate_request *request, struct error *err);
+
+/* ---- placing.c ---- */
+/*
+ * Of the places at which a phantom looks the same, each view's and that of all views. Moves views, refuses those of
+ * which it is not known, and turns *turn, by which the phantom stands, with them.
+ */
+int place_views(struct run *run, double *turn, struct error *err);
 
 /* ---- follow.c ---- */
 /*

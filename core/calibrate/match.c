@@ -20,8 +20,6 @@ static const double SHIFT_MOST = .25;             /* of the detector's longer si
 static const double REACHES[] = {6, 4.5, 3.5, 3}; /* mm at the detector */
 static const double TURN_LIKE_BEST = .8;          /* of the pairs of the best turn */
 
-static const double RIVAL_SHARE = .85; /* of the pairs of the turn taken: another that fits about as well */
-
 struct expected {
 	double pixel[2], radius; /* radius 0: not in front of the source */
 };
@@ -312,21 +310,8 @@ static int climb(const int pairs[TURN_STEPS], int turn)
 	return turn;
 }
 
-/* The turn nearest to `turn`, off its peak, under which about as many balls have shadows; `turn` itself: none. */
-static int rival(const int pairs[TURN_STEPS], int turn)
-{
-	for (int i = 4; i <= TURN_STEPS / 2; i++)
-		for (int side = -1; side <= 1; side += 2) {
-			const int other = (turn + side * i + TURN_STEPS) % TURN_STEPS;
-
-			if (pairs[other] >= RIVAL_SHARE * pairs[turn] && climb(pairs, other) != turn)
-				return climb(pairs, other);
-		}
-	return turn;
-}
-
 int match_turn(const struct match_view *views, int count, const double pixel_mm[2], const struct balls *balls,
-	       double *ret_turn, double *ret_rival, struct error *err)
+	       double *ret_turn, struct error *err)
 {
 	const int used = count < TURN_VIEWS ? count : TURN_VIEWS;
 	int pairs[TURN_STEPS] = {0}, most = 0, best = 0, failed = 0;
@@ -358,6 +343,5 @@ int match_turn(const struct match_view *views, int count, const double pixel_mm[
 			best = t;
 	best = climb(pairs, best);
 	*ret_turn = 2 * M_PI * (best - TURN_STEPS / 2) / TURN_STEPS;
-	*ret_rival = remainder(2 * M_PI * (rival(pairs, best) - best) / TURN_STEPS, 2 * M_PI);
 	return 0;
 }

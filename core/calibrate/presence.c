@@ -72,23 +72,51 @@ static int count_strays(const struct run *run, int view, const struct places *pl
 	return strays;
 }
 
+static void places_of(const struct run *run, const struct pose *pose, struct places *ret)
+{
+	const struct balls *balls = &run->calibration->balls;
+
+	ret->least = INFINITY;
+	ret->most = 0;
+	for (int b = 0; b < balls->count; b++) {
+		ret->radius[b] = pose_shadow(pose, run->request->pixel_mm, &balls->ball[b], ret->place[b]);
+		if (ret->radius[b] > 0)
+			ret->least = fmin(ret->least, ret->radius[b]);
+		ret->most = fmax(ret->most, ret->radius[b]);
+	}
+}
+
+int presence_unexplained(const struct run *run, int view, const struct pose *pose)
+{
+	const struct work *work = &run->works[view];
+	struct places places;
+	int unexplained;
+
+	places_of(run, pose, &places);
+	unexplained = count_strays(run, view, &places);
+	for (int b = 0; b < run->calibration->balls.count; b++) {
+		const double *place = places.place[b], radius = places.radius[b];
+		bool found = !on_picture(run->request->nominal, place, radius) ||
+			     !stands_clear(&places, run->calibration->balls.count, b, place, radius);
+
+		for (int s = 0; s < work->count && !found; s++)
+			found = hypot(work->shadows[s].column - place[0], work->shadows[s].row - place[1]) <= radius;
+		unexplained += !found;
+	}
+	return unexplained;
+}
+
 void presence_count(struct run *run)
 {
 	struct calibration *calibration = run->calibration;
 
 	for (int k = 0; k < calibration->count; k++) {
-		struct places places = {.least = INFINITY};
+		struct places places;
 		int strays;
 
 		if (!calibration->views[k].used)
 			continue;
-		for (int b = 0; b < calibration->balls.count; b++) {
-			places.radius[b] = pose_shadow(&run->works[k].pose, run->request->pixel_mm,
-						       &calibration->balls.ball[b], places.place[b]);
-			if (places.radius[b] > 0)
-				places.least = fmin(places.least, places.radius[b]);
-			places.most = fmax(places.most, places.radius[b]);
-		}
+		places_of(run, &run->works[k].pose, &places);
 		count_balls(run, k, &places);
 		strays = count_strays(run, k, &places);
 		calibration->strays += strays;

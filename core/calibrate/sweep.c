@@ -38,6 +38,23 @@ struct station *stations_of(const struct geometry *nominal)
 	return stations;
 }
 
+int first_station(const struct station *stations, int count)
+{
+	double widest = -1;
+	int first = 0;
+
+	for (int i = 0; i < count; i++) {
+		const double gap = remainder(stations[i].angle - stations[(i + count - 1) % count].angle, 2 * M_PI);
+		const double onward = gap < 0 ? gap + 2 * M_PI : gap;
+
+		if (onward > widest + 1e-9) {
+			widest = onward;
+			first = i;
+		}
+	}
+	return first;
+}
+
 /* Angle from one direction on to another, 0 to 2 pi. */
 static double onward(double from, double to)
 {
@@ -176,23 +193,29 @@ static void neighbours(const struct calibration *calibration, const struct stati
 
 static const int none_aside[2] = {0};
 
+double poses_apart(const struct balls *balls, const double pixel_mm[2], const struct pose *a, const struct pose *b)
+{
+	double squares = 0;
+
+	for (int i = 0; i < balls->count; i++) {
+		double is[2] = {0}, should[2] = {0};
+
+		pose_shadow(a, pixel_mm, &balls->ball[i], is);
+		pose_shadow(b, pixel_mm, &balls->ball[i], should);
+		squares += (is[0] - should[0]) * (is[0] - should[0]) + (is[1] - should[1]) * (is[1] - should[1]);
+	}
+	return sqrt(squares / balls->count);
+}
+
 /* Distance of the balls' shadows in a view from where they would be in another: RMS, pixels. */
 static double apart(const struct calibration *calibration, const struct calibrate_request *request,
 		    const struct view *view, const struct view *other)
 {
 	struct pose own, expected;
-	double squares = 0;
 
 	pose_of_view(&own, view);
 	pose_of_view(&expected, other);
-	for (int b = 0; b < calibration->balls.count; b++) {
-		double is[2] = {0}, should[2] = {0};
-
-		pose_shadow(&own, request->pixel_mm, &calibration->balls.ball[b], is);
-		pose_shadow(&expected, request->pixel_mm, &calibration->balls.ball[b], should);
-		squares += (is[0] - should[0]) * (is[0] - should[0]) + (is[1] - should[1]) * (is[1] - should[1]);
-	}
-	return sqrt(squares / calibration->balls.count);
+	return poses_apart(&calibration->balls, request->pixel_mm, &own, &expected);
 }
 
 /* How a view that is not used gets its pose. */

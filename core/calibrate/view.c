@@ -18,6 +18,7 @@ static const double RMS_MOST = 1;        /* pixels */
 static const double UNEVEN_FACTOR = 4;   /* of the median of the views' residuals */
 static const double UNEVEN_LEAST = .1;   /* pixels */
 static const double NEIGHBOUR_REACH = 4; /* mm at the detector, from a pose between the neighbours' */
+static const double MOVED_REACH = 4;     /* pixels, from the pose of another place that looks the same */
 static const double CLEARANCE = 2;       /* pixels between two shadows that do not touch */
 static const double SETTLED = .99;       /* of a residual, which a pose of another beginning must stay below */
 static const double OPEN_MOST = .5;      /* pixels, by which a view may leave open where the balls are */
@@ -319,6 +320,20 @@ static int refuse_uneven(const struct run *run, struct error *err)
 	return 0;
 }
 
+/* A view anew from a pose, and from so many pairs of it that are in the scratch. False where it has none there. */
+static bool begin_view(const struct run *run, int view, const struct pose *first, int count, struct scratch *scratch)
+{
+	struct pose pose = *first;
+	int used = count >= PAIRS_LEAST ? refine(run, view, &pose, scratch->pairs, count) : count;
+
+	if (used < CLEAR_LEAST * on_picture(run, first))
+		used = use_touching(run, view, first, scratch, &pose, used);
+	if (used < PAIRS_LEAST || used < SHARE_LEAST * on_picture(run, &pose))
+		return false;
+	keep_view(run, view, &pose, scratch->pairs, used);
+	return true;
+}
+
 /*
  * Few balls near to a plane have a second pose that fits them to some hundredths of a pixel, or nearly: a view begins
  * once more from where its neighbours stand, and of both poses the one that fits its own shadows better is its own.
@@ -328,7 +343,7 @@ static void settle_view(const struct run *run, int view, const struct view *betw
 	const struct calibrated_view *result = &run->calibration->views[view];
 	const struct work *work = &run->works[view];
 	struct pair *pairs = scratch->pairs;
-	struct pose pose, first;
+	struct pose pose;
 	int used = work->pair_count;
 
 	pulse_beat();
@@ -336,21 +351,58 @@ static void settle_view(const struct run *run, int view, const struct view *betw
 	if (!(pose_fit(&pose, run->request->pixel_mm, &run->calibration->balls, work->pairs, used) <
 	      SETTLED * result->rms))
 		return;
-	first = pose;
 	memcpy(pairs, work->pairs, (size_t)used * sizeof(*pairs));
-	used = refine(run, view, &pose, pairs, used);
-	if (used < CLEAR_LEAST * on_picture(run, &first))
-		used = use_touching(run, view, &first, scratch, &pose, used);
-	if (used >= PAIRS_LEAST && used >= SHARE_LEAST * on_picture(run, &pose))
-		keep_view(run, view, &pose, pairs, used);
+	begin_view(run, view, &pose, used, scratch);
+}
+
+/* A view that looks the same from another place, which is its own, is found from there. */
+static void find_from(const struct run *run, int view, const struct pose *pose, struct scratch *scratch)
+{
+	const double *pixel_mm = run->request->pixel_mm;
+	const struct balls *balls = &run->calibration->balls;
+	int count = match_pose(&run->matches[view], pose, pixel_mm, balls, MOVED_REACH, scratch->pairs);
+
+	pulse_beat();
+	count = drop_overlaps(run, pose, scratch->pairs, count);
+	if (!begin_view(run, view, pose, count, scratch))
+		refuse(
+		    &run->calibration->views[view],
+		    "%d of its %d shadows are where this phantom has balls, from the place that its neighbours have, "
+		    "expected %d or more",
+		    count, run->works[view].count, PAIRS_LEAST);
 }
 
 /* What a round does: views that are not used begin from the nominal geometry, or from their neighbours. */
-enum round { ROUND_NOMINAL, ROUND_AGAIN, ROUND_SETTLE /* those that are used, from their neighbours */ };
+enum round {
+	ROUND_NOMINAL,
+	ROUND_AGAIN,
+	ROUND_SETTLE, /* those that are used, from their neighbours */
+	ROUND_MOVED   /* of those that are used some, from another place */
+};
 
-/* `between`: of ROUND_SETTLE, where each view's neighbours have it. */
-static int find_round(const struct run *run, double turn, enum round round, const struct view *between,
-		      struct error *err)
+/* What is known of the views when a round begins. */
+struct beginning {
+	double turn;                /* of the phantom, about z */
+	const struct view *between; /* of ROUND_SETTLE: where each view's neighbours have it */
+	const struct pose *poses;   /* of ROUND_MOVED */
+	const bool *moved;
+};
+
+/* A view's part of a round. */
+static void find_in_round(const struct run *run, int view, enum round round, const struct beginning *beginning,
+			  struct scratch *scratch)
+{
+	const bool used = run->calibration->views[view].used;
+
+	if (round == ROUND_SETTLE && used)
+		settle_view(run, view, &beginning->between[view], scratch);
+	else if (round == ROUND_MOVED && used && beginning->moved[view])
+		find_from(run, view, &beginning->poses[view], scratch);
+	else if ((round == ROUND_NOMINAL || round == ROUND_AGAIN) && !used)
+		find_view(run, view, beginning->turn, round == ROUND_AGAIN, scratch);
+}
+
+static int find_round(const struct run *run, enum round round, const struct beginning *beginning, struct error *err)
 {
 	int failed = 0;
 
@@ -360,16 +412,9 @@ static int find_round(const struct run *run, double turn, enum round round, cons
 		bool open = scratch_open(&scratch, run->request->nominal);
 
 #pragma omp for schedule(dynamic)
-		for (int k = 0; k < run->calibration->count; k++) {
-			const bool settle = round == ROUND_SETTLE;
-
-			if (!open || scratch.code < 0 || run->calibration->views[k].used != settle)
-				continue;
-			if (settle)
-				settle_view(run, k, &between[k], &scratch);
-			else
-				find_view(run, k, turn, round == ROUND_AGAIN, &scratch);
-		}
+		for (int k = 0; k < run->calibration->count; k++)
+			if (open && scratch.code == 0)
+				find_in_round(run, k, round, beginning, &scratch);
 		if (scratch.code < 0) {
 #pragma omp critical(calibrate_failed)
 			{
@@ -391,9 +436,14 @@ static int settle_round(const struct run *run, struct error *err)
 				   : error_set(err, ERR_NO_MEMORY, "no memory for %d views", count);
 
 	if (code == 0)
-		code = find_round(run, 0, ROUND_SETTLE, between, err);
+		code = find_round(run, ROUND_SETTLE, &(struct beginning){.between = between}, err);
 	free(between);
 	return code;
+}
+
+int find_moved(const struct run *run, const struct pose *poses, const bool *moved, struct error *err)
+{
+	return find_round(run, ROUND_MOVED, &(struct beginning){.poses = poses, .moved = moved}, err);
 }
 
 /* Why a view's balls leave its pose open: those in a plane say nothing of what is off it. */
@@ -465,6 +515,17 @@ static int used_of(const struct calibration *calibration)
 	return used;
 }
 
+/* Refuses views whose poses are open or none of this sweep, once those that look the same elsewhere have moved there.
+ */
+static int hold_views(struct run *run, double *turn, struct error *err)
+{
+	int code = refuse_open(run, err);
+
+	if (code == 0)
+		code = place_views(run, turn, err);
+	return code == 0 ? follow_refuse(run->calibration, run->request, *turn, err) : code;
+}
+
 /*
  * The first round begins from the nominal geometry; views that it refused begin once more, from where their neighbours
  * stand.
@@ -473,13 +534,11 @@ static int used_of(const struct calibration *calibration)
 int find_views(struct run *run, double turn, struct error *err)
 {
 	struct calibration *calibration = run->calibration;
-	int code = find_round(run, turn, ROUND_NOMINAL, NULL, err);
+	int code = find_round(run, ROUND_NOMINAL, &(struct beginning){.turn = turn}, err);
 
 	/* Neighbours are judged, and others begun from them, once none of them is on another side of the phantom. */
 	if (code == 0)
-		code = refuse_open(run, err);
-	if (code == 0)
-		code = follow_refuse(calibration, run->request, turn, err);
+		code = hold_views(run, &turn, err);
 	if (code == 0)
 		code = refuse_uneven(run, err);
 	/* Each round may give other views neighbours that are nearer. */
@@ -487,11 +546,9 @@ int find_views(struct run *run, double turn, struct error *err)
 		before = used_of(calibration);
 		code = sweep_fill(calibration, run->request->nominal, err);
 		if (code == 0)
-			code = find_round(run, turn, ROUND_AGAIN, NULL, err);
+			code = find_round(run, ROUND_AGAIN, &(struct beginning){.turn = turn}, err);
 		if (code == 0)
-			code = refuse_open(run, err);
-		if (code == 0)
-			code = follow_refuse(calibration, run->request, turn, err);
+			code = hold_views(run, &turn, err);
 	}
 	if (code == 0)
 		code = settle_round(run, err);

@@ -138,16 +138,10 @@ static void add_warnings(cJSON *document, const cJSON *result)
 
 cJSON *calibration_brief(const char *id, const cJSON *request, const cJSON *result, const struct error *failure)
 {
-	static const char *const figures[] = {"used",
-					      "residual_pixels",
-					      "residual_isocentre_mm",
-					      "turned_deg",
-					      "other_turn_deg",
-					      "diameter_ratio",
-					      "distance_ratio",
-					      "balls_moved_mm",
-					      "interpolated_pixels",
-					      "interpolated_isocentre_mm"};
+	static const char *const figures[] = {
+	    "used",           "residual_pixels",     "residual_isocentre_mm",    "turned_deg",
+	    "other_turn_deg", "other_height_mm",     "diameter_ratio",           "distance_ratio",
+	    "balls_moved_mm", "interpolated_pixels", "interpolated_isocentre_mm"};
 	const cJSON *balls = cJSON_GetObjectItemCaseSensitive(result, "balls_mm");
 	cJSON *document = cJSON_CreateObject();
 	char href[64];

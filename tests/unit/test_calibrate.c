@@ -471,7 +471,8 @@ START_TEST(a_phantom_beside_its_place_is_taken_for_no_other)
 	scene.target = (struct target){.balls = &standing, .ball = .7, .photons = 20000};
 	ck_assert_msg(run(&scene, &drawing, false, &calibration, &err) == 0, "%s", err.text);
 	ck_assert_double_eq_tol(calibration.turn, beside[_i].turn, .02);
-	ck_assert_double_ge(fabs(calibration.rival_turn), .2);
+	/* A helix that is a ball further along itself lacks one at its end, and has another at its other end. */
+	ck_assert((fabs(calibration.rival_turn) > .2) == (beside[_i].circles.balls > 0));
 	for (int k = 0; k < calibration.count; k++)
 		for (int b = 0; b < drawing.count && calibration.views[k].used; b++) {
 			const struct view truth = arm_view(&scene.arm, k);
@@ -561,43 +562,6 @@ START_TEST(a_view_from_another_side_of_the_phantom_is_refused)
 	for (int k = 0; k < VIEWS; k++)
 		ck_assert_msg(views[k].used == !refused[k] && (views[k].refused[0] != '\0') == refused[k],
 			      "view %d is %s: %s", k, views[k].used ? "used" : "refused", views[k].refused);
-	geometry_clear(&nominal);
-}
-END_TEST
-
-/* Circles one above the other look the same a circle further along the axis: a view that slipped so is refused. */
-START_TEST(a_view_that_is_a_circle_aside_is_refused)
-{
-	enum { VIEWS = 30 };
-	static const int slipped[] = {0, 5, 6, 7, 20};
-	const double pixel_mm[2] = {.7, .7}, circle = 22;
-	const struct arm arm = {.columns = 200,
-				.rows = 116,
-				.count = VIEWS,
-				.pixel = .7,
-				.step = 200 * M_PI / 180 / (VIEWS - 1),
-				.sag = 1,
-				.jitter = 1,
-				.seed = 5};
-	struct geometry nominal;
-	struct calibrated_view views[VIEWS];
-	struct calibration calibration = {.count = VIEWS, .views = views};
-	const struct calibrate_request request = {.nominal = &nominal, .pixel_mm = pixel_mm};
-	bool refused[VIEWS] = {false};
-	struct error err = {0};
-
-	use_views(&arm, &nominal, views);
-	for (size_t i = 0; i < sizeof(slipped) / sizeof(*slipped); i++) {
-		struct view *view = &views[slipped[i]].view;
-
-		view->source[2] += circle;
-		view->pixel0[2] += circle;
-		refused[slipped[i]] = true;
-	}
-	ck_assert_msg(follow_refuse(&calibration, &request, 0, &err) == 0, "%s", err.text);
-	for (int k = 0; k < VIEWS; k++)
-		ck_assert_msg(views[k].used == !refused[k], "view %d is %s: %s", k, views[k].used ? "used" : "refused",
-			      views[k].refused);
 	geometry_clear(&nominal);
 }
 END_TEST
@@ -918,7 +882,6 @@ Suite *calibrate_suite(void)
 			    sizeof(beside) / sizeof(*beside));
 	tcase_add_test(tests, the_ends_of_a_short_sweep_follow_no_view);
 	tcase_add_test(tests, a_view_from_another_side_of_the_phantom_is_refused);
-	tcase_add_test(tests, a_view_that_is_a_circle_aside_is_refused);
 	tcase_add_test(tests, a_code_that_reads_the_same_backwards_is_refused);
 	tcase_add_test(tests, the_code_of_two_sizes_finds_a_phantom_however_it_is_turned);
 	tcase_add_test(tests, adjusting_the_balls_takes_errors_of_machining_out);

@@ -261,9 +261,7 @@ static const struct {
 	double first;
 	unsigned seed;
 } flat[] = {
-    {{.circles = 2, .balls = 14, .diameter = 106, .distance = 19, .ball = 5.7, .shift = M_PI / 14}, 19, 3.6, 5},
     {{.circles = 2, .balls = 14, .diameter = 106, .distance = 19, .ball = 5.7, .shift = M_PI / 14}, 19, 2.7, 4},
-    {{.circles = 2, .balls = 16, .diameter = 119.1, .distance = 21.9, .ball = 7.5, .shift = M_PI / 16}, 30, 4.12, 5},
 };
 
 static void tilt_and_shift(struct ball *ball, double tilt, const double shift[3])
@@ -316,6 +314,61 @@ START_TEST(views_of_a_flat_phantom_begin_from_their_neighbours)
 }
 END_TEST
 
+/*
+ * Like circles one above the other, of which those at an end are partly or wholly beside the picture: those that a view
+ * shows could be the next ones as well. What all views show tells, or that it is not known is told.
+ */
+static const struct {
+	int circles, balls, count;
+	double distance, height; /* of the circles; mm, of the phantom's middle */
+	double found, other;     /* mm: of the place that is taken, from where it stood; of another from there */
+} heights[] = {
+    {.circles = 4, .balls = 6, .distance = 12, .height = -4, .count = 28},
+    {.circles = 3, .balls = 6, .distance = 22, .height = 0, .count = 30},
+    {.circles = 4, .balls = 8, .distance = 15, .height = 22, .count = 20},
+    {.circles = 4, .balls = 8, .distance = 15, .height = 10, .count = 20, .found = 15, .other = -15},
+};
+
+START_TEST(of_like_circles_each_is_taken_for_itself)
+{
+	const struct ball_circles like = {.circles = heights[_i].circles,
+					  .balls = heights[_i].balls,
+					  .diameter = 60,
+					  .distance = heights[_i].distance,
+					  .ball = 3};
+	struct arm_scene scene = {.arm = {.columns = 200,
+					  .rows = 116,
+					  .count = heights[_i].count,
+					  .pixel = .7,
+					  .step = 2 * M_PI / heights[_i].count,
+					  .sag = 1}};
+	struct balls balls, drawing;
+	struct calibration calibration;
+	struct error err = {0};
+
+	ck_assert(balls_circles(&drawing, &like, &err) == 0);
+	ck_assert(balls_circles(&balls, &like, &err) == 0);
+	for (int b = 0; b < balls.count; b++)
+		balls.ball[b].centre[2] += heights[_i].height;
+	scene.target = (struct target){.balls = &balls, .ball = .5, .photons = 20000};
+	ck_assert_msg(arm_calibrate(&scene.arm, arm_image, &scene, &drawing, false, &calibration, &err) == 0, "%s",
+		      err.text);
+	for (int k = 0; k < calibration.count; k++) {
+		struct view *view = &calibration.views[k].view;
+
+		view->source[2] += heights[_i].height - heights[_i].found;
+		view->pixel0[2] += heights[_i].height - heights[_i].found;
+		if (calibration.views[k].used)
+			ck_assert_msg(arm_wrong(&scene.arm, k, view) <= 1, "view %d is wrong by %.1f pixels", k,
+				      arm_wrong(&scene.arm, k, view));
+	}
+	ck_assert_double_eq_tol(calibration.rival_height, heights[_i].other, 1e-6);
+	calibration_clear(&calibration);
+	balls_clear(&balls);
+	balls_clear(&drawing);
+}
+END_TEST
+
 Suite *calibrate_views_suite(void)
 {
 	Suite *suite = suite_create("calibrate_views");
@@ -329,6 +382,7 @@ Suite *calibrate_views_suite(void)
 	tcase_add_loop_test(tests, views_of_a_flat_phantom_begin_from_their_neighbours, 0,
 			    sizeof(flat) / sizeof(*flat));
 	tcase_add_test(tests, a_pose_is_found_down_a_long_valley);
+	tcase_add_loop_test(tests, of_like_circles_each_is_taken_for_itself, 0, sizeof(heights) / sizeof(*heights));
 	suite_add_tcase(suite, tests);
 	return suite;
 }

@@ -1,0 +1,310 @@
+/*
+ * Where a phantom that looks the same from several places stood. Moved along a drawing's own motions (a ball further
+ * about z, a circle further along it) a view's pose fits its shadows as well, where the balls that make the difference
+ * are off the picture. Three things tell of the right one, in this order:
+ *
+ *   - an arm sags smoothly: of a view's places the one that is nearest to where the view before has the balls is its
+ *     own, if the next best is much farther away. So views are chained, each moved to its chain's place;
+ *   - what all views of a chain show: in another place balls should be on the picture of which nothing is there, and
+ *     shadows are there of no ball;
+ *   - of places that explain as much the one nearest to the nominal geometry is taken, and that there are others is
+ *     told.
+ */
+#include <math.h>
+#include <stdio.h>
+#include <stdlib.h>
+
+#include "core/calibrate/internal.h"
+#include "core/pulse.h"
+#include "core/select.h"
+
+static const double FARTHER = 2; /* times as far as the nearest place is the next one of a view that is chained */
+static const double SURE = 2;    /* standard deviations, between the numbers of what is not explained */
+
+/* A view in the order of the sweep. */
+struct stance {
+	struct pose pose;     /* as it was found */
+	struct motion motion; /* by which it is moved */
+	double angle;         /* radians, of its nominal source */
+	int view, chain;
+};
+
+struct chain {
+	int last, count; /* stance; how many */
+};
+
+struct placing {
+	const struct run *run;
+	struct stance *stances; /* [count] */
+	struct chain *chains;   /* [chain_count] */
+	int count, chain_count;
+	double axis[2]; /* mm, of the arm's turn, in the drawing's world */
+};
+
+static struct motion sum_of(const struct motion *a, const struct motion *b)
+{
+	return (struct motion){.turn = a->turn + b->turn, .along = a->along + b->along};
+}
+
+static struct pose moved(const struct stance *stance, const struct motion *further)
+{
+	const struct motion motion = sum_of(&stance->motion, further);
+	struct pose pose = stance->pose;
+
+	pose_move(&pose, &motion);
+	return pose;
+}
+
+/* Turns a pose about the arm's axis. */
+static void turn_on(const struct placing *placing, struct pose *pose, double angle)
+{
+	for (int a = 0; a < 2; a++)
+		pose->source[a] -= placing->axis[a];
+	pose_turn(pose, angle);
+	for (int a = 0; a < 2; a++)
+		pose->source[a] += placing->axis[a];
+}
+
+/* The motion that brings a view nearest to where another has the balls; false if another does nearly. */
+static bool nearest(const struct placing *placing, const struct stance *last, const struct stance *next,
+		    struct motion *ret_motion)
+{
+	const struct run *run = placing->run;
+	const struct motions *motions = &run->motions;
+	struct pose expected = moved(last, &motions->motion[0]);
+	double least = INFINITY, second = INFINITY;
+
+	turn_on(placing, &expected, next->angle - last->angle);
+	for (int m = 0; m < motions->count; m++) {
+		const struct pose pose = moved(next, &motions->motion[m]);
+		const double apart = poses_apart(&run->calibration->balls, run->request->pixel_mm, &pose, &expected);
+
+		if (apart < least) {
+			second = least;
+			least = apart;
+			*ret_motion = motions->motion[m];
+		} else {
+			second = fmin(second, apart);
+		}
+	}
+	return FARTHER * least <= second;
+}
+
+/* Puts a view to the longest chain that it goes on with, or begins one. */
+static void chain_view(struct placing *placing, int at)
+{
+	struct stance *stance = &placing->stances[at];
+	struct motion best = {0};
+	int own = -1;
+
+	for (int c = 0; c < placing->chain_count; c++) {
+		struct motion motion = {0};
+
+		if ((own < 0 || placing->chains[c].count > placing->chains[own].count) &&
+		    nearest(placing, &placing->stances[placing->chains[c].last], stance, &motion)) {
+			own = c;
+			best = motion;
+		}
+	}
+	if (own < 0) {
+		own = placing->chain_count++;
+		placing->chains[own].count = 0;
+	}
+	stance->motion = best;
+	stance->chain = own;
+	placing->chains[own].last = at;
+	placing->chains[own].count++;
+}
+
+/* What a chain's views do not explain, moved further, over all of them. */
+static int unexplained(const struct placing *placing, int chain, const struct motion *further)
+{
+	int sum = 0;
+
+#pragma omp parallel for schedule(dynamic) reduction(+ : sum)
+	for (int i = 0; i < placing->count; i++) {
+		const struct stance *stance = &placing->stances[i];
+		struct pose pose;
+
+		if (stance->chain != chain)
+			continue;
+		pose = moved(stance, further);
+		sum += presence_unexplained(placing->run, stance->view, &pose);
+	}
+	return sum;
+}
+
+/* How far a chain's views, moved further, are from their nominal ones: the mean of the squares, pixels. */
+static double aside(const struct placing *placing, int chain, const struct motion *further)
+{
+	const struct run *run = placing->run;
+	double squares = 0;
+
+	for (int i = 0; i < placing->count; i++) {
+		const struct stance *stance = &placing->stances[i];
+		struct pose pose;
+
+		if (stance->chain != chain)
+			continue;
+		pose = moved(stance, further);
+		squares += pow(poses_apart(&run->calibration->balls, run->request->pixel_mm, &pose,
+					   &run->matches[stance->view].nominal),
+			       2);
+	}
+	return squares / placing->chains[chain].count;
+}
+
+/* Tells of the other places that explain as much: the next one about z, and the next one along it. */
+static void tell_rivals(struct calibration *calibration, const struct motions *motions, const bool *equal, int own)
+{
+	double turn = INFINITY, along = INFINITY;
+
+	for (int m = 0; m < motions->count; m++) {
+		const double further = motions->motion[m].along - motions->motion[own].along;
+		const double round = remainder(motions->motion[m].turn - motions->motion[own].turn, 2 * M_PI);
+
+		if (m == own || !equal[m])
+			continue;
+		if (motions->motion[m].along == motions->motion[own].along) {
+			if (fabs(round) < fabs(turn))
+				turn = round;
+		} else if (fabs(further) < fabs(along)) {
+			along = further;
+		}
+	}
+	calibration->rival_turn = isfinite(turn) ? turn : 0;
+	calibration->rival_height = isfinite(along) ? along : 0;
+}
+
+/* The place of a chain's views; tells of others that explain as much. */
+static struct motion settle(const struct placing *placing, int chain)
+{
+	const struct motions *motions = &placing->run->motions;
+	int missed[MOTIONS_MOST], least, own = 0;
+	bool equal[MOTIONS_MOST];
+	double near = INFINITY;
+
+	for (int m = 0; m < motions->count; m++) {
+		missed[m] =
+		    m > 0 && motions->motion[m].whole ? missed[0] : unexplained(placing, chain, &motions->motion[m]);
+		least = m == 0 || missed[m] < least ? missed[m] : least;
+		pulse_beat();
+	}
+	for (int m = 0; m < motions->count; m++) {
+		double from;
+
+		equal[m] = missed[m] - least <= SURE * sqrt(missed[m] + least);
+		from = equal[m] ? aside(placing, chain, &motions->motion[m]) : INFINITY;
+		if (from < near) {
+			near = from;
+			own = m;
+		}
+	}
+	tell_rivals(placing->run->calibration, motions, equal, own);
+	return motions->motion[own];
+}
+
+/* All views that are used, in the order of the sweep. */
+static void take_stances(struct placing *placing, const struct station *stations)
+{
+	const struct calibration *calibration = placing->run->calibration;
+	const int first = first_station(stations, calibration->count);
+
+	for (int n = 0; n < calibration->count; n++) {
+		const struct station *station = &stations[(first + n) % calibration->count];
+
+		if (!calibration->views[station->view].used)
+			continue;
+		placing->stances[placing->count] = (struct stance){.view = station->view, .angle = station->angle};
+		pose_of_view(&placing->stances[placing->count++].pose, &calibration->views[station->view].view);
+	}
+}
+
+/*
+ * Where the arm's axis is to a phantom that may stand beside it: the median of the points about which sources turn from
+ * a view to the next by their nominal angle. The arm sags, and views may stand elsewhere about the phantom.
+ */
+static int find_axis(struct placing *placing, struct error *err)
+{
+	float *points = malloc(2 * (size_t)placing->count * sizeof(*points));
+	int count = 0;
+
+	if (points == NULL)
+		return error_set(err, ERR_NO_MEMORY, "no memory for %d views", placing->count);
+	for (int i = 1; i < placing->count; i++) {
+		const struct stance *last = &placing->stances[i - 1], *next = &placing->stances[i];
+		const double *from = last->pose.source, *to = next->pose.source, turn = next->angle - last->angle;
+		const double half = tan(.5 * turn);
+
+		/* Half way, and across it. */
+		if (!(fabs(half) > 1e-6))
+			continue;
+		points[count] = (float)(.5 * (from[0] + to[0] - (to[1] - from[1]) / half));
+		points[placing->count + count++] = (float)(.5 * (from[1] + to[1] + (to[0] - from[0]) / half));
+	}
+	for (int a = 0; a < 2; a++)
+		placing->axis[a] = count > 0 ? select_kth(points + a * placing->count, count, count / 2) : 0;
+	free(points);
+	return 0;
+}
+
+/* Refuses the views beside the longest chain, and writes where the others are moved to. */
+static void decide(struct placing *placing, double *turn, struct pose *poses, bool *is_moved)
+{
+	struct calibration *calibration = placing->run->calibration;
+	struct motion further;
+	int longest = 0;
+
+	for (int i = 0; i < placing->count; i++)
+		chain_view(placing, i);
+	for (int c = 1; c < placing->chain_count; c++)
+		longest = placing->chains[c].count > placing->chains[longest].count ? c : longest;
+	further = settle(placing, longest);
+	*turn = remainder(*turn - further.turn, 2 * M_PI);
+	for (int i = 0; i < placing->count; i++) {
+		const struct stance *stance = &placing->stances[i];
+		struct calibrated_view *view = &calibration->views[stance->view];
+		const struct motion motion = sum_of(&stance->motion, &further);
+
+		if (stance->chain != longest) {
+			view->used = false;
+			snprintf(view->refused, sizeof(view->refused),
+				 "it may as well see the phantom from another place, where it looks the same: the %d "
+				 "views that follow each other, of %d, do not tell which",
+				 placing->chains[longest].count, placing->count);
+			continue;
+		}
+		is_moved[stance->view] = motion.turn != 0 || motion.along != 0;
+		poses[stance->view] = moved(stance, &further);
+	}
+}
+
+int place_views(struct run *run, double *turn, struct error *err)
+{
+	const int count = run->calibration->count;
+	struct station *stations = stations_of(run->request->nominal);
+	struct placing placing = {.run = run,
+				  .stances = malloc((size_t)count * sizeof(*placing.stances)),
+				  .chains = malloc((size_t)count * sizeof(*placing.chains))};
+	struct pose *poses = malloc((size_t)count * sizeof(*poses));
+	bool *is_moved = calloc((size_t)count, sizeof(*is_moved));
+	int code = 0;
+
+	if (stations == NULL || placing.stances == NULL || placing.chains == NULL || poses == NULL || is_moved == NULL)
+		code = error_set(err, ERR_NO_MEMORY, "no memory for %d views", count);
+	else
+		take_stances(&placing, stations);
+	if (placing.count > 0 && run->motions.count > 1) {
+		code = find_axis(&placing, err);
+		if (code == 0) {
+			decide(&placing, turn, poses, is_moved);
+			code = find_moved(run, poses, is_moved, err);
+		}
+	}
+	free(stations);
+	free(placing.stances);
+	free(placing.chains);
+	free(poses);
+	free(is_moved);
+	return code;
+}
