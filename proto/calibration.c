@@ -409,44 +409,72 @@ static void add_doubt(cJSON *doubts, const char *code, const char *detail)
 
 static const int views_least = 3; /* that tell of a ball */
 
-/* Balls of the drawing that were never seen, in words; "" for none. */
-static void tell_unseen(const cJSON *json, char *text, size_t size)
+/* Some of the drawing's balls, by their numbers. */
+struct numbered {
+	char balls[120];
+	int count, views; /* views: that would show one of them alone, at most */
+};
+
+/* Balls that are not where they should be seen; or those that no view shows, or would show, alone. */
+static struct numbered balls_not_found(const cJSON *json, bool off_picture)
 {
+	struct numbered ret = {.count = 0};
 	const cJSON *entry;
-	char balls[120] = "";
-	int ball = 0, unseen = 0, most = 0;
+	int ball = 0;
 
 	cJSON_ArrayForEach(entry, cJSON_GetObjectItemCaseSensitive(json, "presence"))
 	{
 		const int expected = cJSON_GetArrayItem(entry, 0)->valueint,
 			  found = cJSON_GetArrayItem(entry, 1)->valueint;
+		const size_t length = strlen(ret.balls);
 
 		/* Another's shadow may lie there by chance. */
-		if (expected >= views_least && 10 * found <= expected) {
-			const size_t length = strlen(balls);
-
-			if (length + 16 < sizeof(balls))
-				snprintf(balls + length, sizeof(balls) - length, "%s%d", unseen > 0 ? ", " : "", ball);
-			else if (balls[length - 1] != '.')
-				snprintf(balls + length, sizeof(balls) - length, " ...");
-			unseen++;
-			most = expected > most ? expected : most;
+		if (off_picture ? expected == 0 : expected >= views_least && 10 * found <= expected) {
+			if (length + 16 < sizeof(ret.balls))
+				snprintf(ret.balls + length, sizeof(ret.balls) - length, "%s%d",
+					 ret.count > 0 ? ", " : "", ball);
+			else if (ret.balls[length - 1] != '.')
+				snprintf(ret.balls + length, sizeof(ret.balls) - length, " ...");
+			ret.count++;
+			ret.views = expected > ret.views ? expected : ret.views;
 		}
 		ball++;
 	}
+	return ret;
+}
+
+/* Balls of the drawing that were never seen, in words; "" for none. */
+static void tell_unseen(const cJSON *json, char *text, size_t size)
+{
+	const struct numbered unseen = balls_not_found(json, false);
+
 	text[0] = '\0';
-	if (unseen == 1)
+	if (unseen.count == 1)
 		snprintf(text, size,
 			 "ball %s of the drawing (counted from 0) is not where the drawing has it, in %d views that "
-			 "would show "
-			 "it alone",
-			 balls, most);
-	if (unseen > 1)
+			 "would show it alone",
+			 unseen.balls, unseen.views);
+	if (unseen.count > 1)
 		snprintf(text, size,
 			 "balls %s of the drawing (counted from 0) are not where the drawing has them, in up to %d "
-			 "views that "
-			 "would show each alone",
-			 balls, most);
+			 "views that would show each alone",
+			 unseen.balls, unseen.views);
+}
+
+/* Balls beside the picture in all views are no more than that, but of a tenth of a drawing one may want to know. */
+static void doubt_hidden(const cJSON *json, cJSON *doubts)
+{
+	const struct numbered hidden = balls_not_found(json, true);
+	const int count = cJSON_GetArraySize(cJSON_GetObjectItemCaseSensitive(json, "presence"));
+	char detail[320];
+
+	if (hidden.count == 0 || 10 * hidden.count < count)
+		return;
+	snprintf(detail, sizeof(detail),
+		 "%d of the drawing's %d balls, %s (counted from 0), are clear on the picture in no view that is used: "
+		 "nothing tells whether the phantom has them",
+		 hidden.count, count, hidden.balls);
+	add_doubt(doubts, "calibration_balls", detail);
 }
 
 /* The phantom may have a ball that the drawing has not, or the other way about. */
@@ -455,6 +483,7 @@ static void doubt_balls(const cJSON *json, cJSON *doubts)
 	const double used = number_of(json, "used", 0), views = number_of(json, "stray_views", 0);
 	char detail[480], unseen[280], strays[120] = "";
 
+	doubt_hidden(json, doubts);
 	tell_unseen(json, unseen, sizeof(unseen));
 	/* As a ball of the drawing, one beside it stands clear in some views only. */
 	if (views >= views_least && 4 * views >= used)

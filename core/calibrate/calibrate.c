@@ -217,7 +217,7 @@ static int summarise(struct run *run, struct error *err)
 	return 0;
 }
 
-/* The view whose refusal stands for the others': the one with the middle residual. */
+/* The view whose refusal stands for the others', and the mean residual of those that were fitted. */
 static const struct calibrated_view *typical_refusal(const struct calibration *calibration, double *ret_residual)
 {
 	const struct calibrated_view *first = NULL;
@@ -262,31 +262,52 @@ static double nearest_pose(const struct run *run, int view, double turn, struct 
 	return rms;
 }
 
-/*
- * What is left under the pose that comes nearest with the most balls of any view, in words; "" where no view has the
- * shadows for one.
+/* What is left under the pose that comes nearest with the most balls of a refused view; 0 where none has the shadows.
  */
-static void tell_nearest(const struct run *run, double turn, char *text, size_t size)
+static double nearest_residual(const struct run *run, double turn, int *ret_balls)
 {
 	struct pair pairs[BALLS_MOST];
-	double best = INFINITY;
-	int balls = 0;
+	double best = 0;
 
+	*ret_balls = 0;
 	for (int k = 0; k < run->calibration->count; k++) {
 		int count = 0;
-		const double rms = nearest_pose(run, k, turn, pairs, &count);
+		double rms;
 
+		if (run->calibration->views[k].used)
+			continue;
+		rms = nearest_pose(run, k, turn, pairs, &count);
 		pulse_beat();
 		/* Few balls are always near some shadow. */
-		if (count > balls || (count == balls && rms < best)) {
+		if (count > *ret_balls || (count == *ret_balls && rms < best)) {
 			best = rms;
-			balls = count;
+			*ret_balls = count;
 		}
 	}
-	if (isfinite(best))
-		snprintf(text, size, ": the best leaves a residual of %.2f pixels over %d balls", best, balls);
-	else
-		text[0] = '\0';
+	return best;
+}
+
+/* Why so many views are refused, in words: they fit no pose, or what fits is too little. */
+static void tell_misfit(const struct run *run, double turn, double residual, char *text, size_t size)
+{
+	int balls;
+
+	if (residual > RMS_MOST) {
+		snprintf(text, size, "do not fit this phantom, at a mean residual of %.2f pixels", residual);
+	} else if (residual > 0) {
+		snprintf(text, size, "cannot be used, expected at most %.0f %%, though poses fit them to %.2f pixels",
+			 100 * (1 - USED_LEAST), residual);
+	} else {
+		residual = nearest_residual(run, turn, &balls);
+		if (residual > RMS_MOST)
+			snprintf(text, size,
+				 "do not fit this phantom, and no pose could be fitted to any of them: the best leaves "
+				 "a residual of %.2f pixels over %d balls",
+				 residual, balls);
+		else
+			snprintf(text, size, "show too little of this phantom, expected at most %.0f %%",
+				 100 * (1 - USED_LEAST));
+	}
 }
 
 static int check_result(const struct run *run, double turn, struct error *err)
@@ -297,15 +318,10 @@ static int check_result(const struct run *run, double turn, struct error *err)
 
 	if (calibration->used < USED_LEAST * calibration->count) {
 		const struct calibrated_view *view = typical_refusal(calibration, &residual);
-		char how[128], nearest[80];
+		char how[160];
 
-		if (residual > 0) {
-			snprintf(how, sizeof(how), "at a mean residual of %.2f pixels", residual);
-		} else {
-			tell_nearest(run, turn, nearest, sizeof(nearest));
-			snprintf(how, sizeof(how), "and no pose could be fitted to any of them%s", nearest);
-		}
-		return error_set(err, ERR_IMPOSSIBLE, "%d of %d views do not fit this phantom, %s; view %td: %s",
+		tell_misfit(run, turn, residual, how, sizeof(how));
+		return error_set(err, ERR_IMPOSSIBLE, "%d of %d views %s; view %td: %s",
 				 calibration->count - calibration->used, calibration->count, how,
 				 view - calibration->views, view->refused);
 	}

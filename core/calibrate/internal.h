@@ -178,6 +178,7 @@ int bundle_fit(const struct bundle_view *views, int count, const double pixel_mm
 
 /* ---- view.c ---- */
 enum { PAIRS_LEAST = 7 }; /* of a view: nine unknowns, and some balls to hold them against */
+enum { RMS_MOST = 1 };    /* pixels, of a view */
 
 /* Findings in one view while the scan is calibrated. */
 struct work {

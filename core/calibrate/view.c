@@ -14,7 +14,6 @@
 
 static const double SHARE_LEAST = .4;    /* of the balls whose shadows should be on the picture */
 static const double CLEAR_LEAST = .75;   /* of them, below which those that touch are fitted, too */
-static const double RMS_MOST = 1;        /* pixels */
 static const double UNEVEN_FACTOR = 4;   /* of the median of the views' residuals */
 static const double UNEVEN_LEAST = .1;   /* pixels */
 static const double NEIGHBOUR_REACH = 4; /* mm at the detector, from a pose between the neighbours' */
@@ -92,6 +91,12 @@ static int on_picture(const struct run *run, const struct pose *pose)
 			 pixel[1] < nominal->rows - 1 - edge;
 	}
 	return count;
+}
+
+/* True where shadows that touch are fitted, too: so few stand clear, for a pose or of those on the picture. */
+static bool few_clear(const struct run *run, const struct pose *pose, int clear)
+{
+	return clear < PAIRS_LEAST || clear < CLEAR_LEAST * on_picture(run, pose);
 }
 
 /* The pose of new pairs, `drop`: without those that are far off. False where there are too few. */
@@ -253,7 +258,7 @@ static void keep_view(const struct run *run, int view, const struct pose *pose, 
 	result->used = true;
 	result->refused[0] = '\0';
 	if (result->rms > RMS_MOST)
-		refuse(result, "its residual is %.2f pixels, expected at most %g", result->rms, RMS_MOST);
+		refuse(result, "its residual is %.2f pixels, expected at most %d", result->rms, RMS_MOST);
 }
 
 static void find_view(const struct run *run, int view, double turn, bool again, struct scratch *scratch)
@@ -276,20 +281,21 @@ static void find_view(const struct run *run, int view, double turn, bool again, 
 	} else {
 		return;
 	}
-	if (used < CLEAR_LEAST * on_picture(run, &first))
+	if (few_clear(run, &first, used))
 		used = use_touching(run, view, &first, scratch, &pose, used);
 	if (used == 0 && agreeing == 0)
 		return;
 	expected = on_picture(run, &pose);
-	if (used < PAIRS_LEAST || used < SHARE_LEAST * expected) {
-		refuse(
-		    result,
-		    "one pose explains %d of its %d shadows, of the %d balls that it should show, with a residual of "
-		    "%.2f pixels over %d shadows before",
-		    used, work->count, expected, result->rms, agreeing);
-		return;
-	}
-	keep_view(run, view, &pose, pairs, used);
+	if (used < PAIRS_LEAST)
+		refuse(result,
+		       "%d of its %d shadows lie where a pose has balls, clear of others or told apart from them, "
+		       "expected %d or more",
+		       used, work->count, PAIRS_LEAST);
+	else if (used < SHARE_LEAST * expected)
+		refuse(result, "one pose explains %d of the %d balls that it should show, expected %.0f or more", used,
+		       expected, ceil(SHARE_LEAST * expected));
+	else
+		keep_view(run, view, &pose, pairs, used);
 }
 
 /*
@@ -326,7 +332,7 @@ static bool begin_view(const struct run *run, int view, const struct pose *first
 	struct pose pose = *first;
 	int used = count >= PAIRS_LEAST ? refine(run, view, &pose, scratch->pairs, count) : count;
 
-	if (used < CLEAR_LEAST * on_picture(run, first))
+	if (few_clear(run, first, used))
 		used = use_touching(run, view, first, scratch, &pose, used);
 	if (used < PAIRS_LEAST || used < SHARE_LEAST * on_picture(run, &pose))
 		return false;

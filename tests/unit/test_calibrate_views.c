@@ -23,15 +23,25 @@ static const struct arm arm_coarse = {.columns = 200,
 static const struct ball_circles circles = {
     .circles = 2, .balls = 11, .diameter = 110, .distance = 90, .ball = 5, .first = .2, .shift = M_PI / 11};
 
-/* What is seen of the phantom in one view: the balls of its first circle alone. */
-static int take_a_plane(void *context, int view, float *ret_image, struct error *err)
+/* What is seen of the phantom in some views: the balls of its first circle alone. */
+static int take_planes(void *context, int view, int every, float *ret_image, struct error *err)
 {
 	struct arm_scene scene = *(const struct arm_scene *)context;
 	const struct balls half = {.count = circles.balls, .ball = scene.target.balls->ball};
 
-	if (view == 10)
+	if (view % every == 0 && view > 0)
 		scene.target.balls = &half;
 	return arm_image(&scene, view, ret_image, err);
+}
+
+static int take_a_plane(void *context, int view, float *ret_image, struct error *err)
+{
+	return take_planes(context, view, 10, ret_image, err);
+}
+
+static int take_many_planes(void *context, int view, float *ret_image, struct error *err)
+{
+	return take_planes(context, view, 3, ret_image, err);
 }
 
 /* Any source along a curve sees the balls of a plane where they are, the others of the phantom wherever it likes. */
@@ -55,6 +65,25 @@ START_TEST(a_view_of_balls_in_a_plane_is_refused)
 	ck_assert_str_eq(calibration.views[10].refused,
 			 "the 11 balls that it shows lie nearly in a plane, which does not determine its pose");
 	calibration_clear(&calibration);
+	balls_clear(&balls);
+}
+END_TEST
+
+/* Poses fit them as well as any: it is not said that they do not. */
+START_TEST(too_many_views_that_fit_are_told_so)
+{
+	struct arm_scene scene = {.arm = arm_coarse};
+	struct balls balls;
+	struct calibration calibration;
+	struct error err = {0};
+
+	ck_assert(balls_circles(&balls, &circles, &err) == 0);
+	scene.target = (struct target){.balls = &balls, .ball = .4, .rays = 1};
+	ck_assert_int_eq(arm_calibrate(&scene.arm, take_many_planes, &scene, &balls, false, &calibration, &err),
+			 ERR_IMPOSSIBLE);
+	ck_assert_msg(strstr(err.text, "6 of 20 views cannot be used, expected at most 25 %, though poses fit them to "
+				       "0.") == err.text,
+		      "%s", err.text);
 	balls_clear(&balls);
 }
 END_TEST
@@ -136,6 +165,32 @@ START_TEST(a_pose_is_found_down_a_long_valley)
 	}
 	/* A few begin nearer to another pose, with a least residual of its own. */
 	ck_assert_int_le(others, 2);
+}
+END_TEST
+
+/*
+ * As few balls as a phantom may have. In some views two of them touch: six that stand clear make no pose, and those
+ * that touch are fitted together with them.
+ */
+START_TEST(eight_balls_are_enough_in_all_views)
+{
+	static const struct ball eight[] = {{{56.1, -19, 33.4}, 5.1},    {{11.1, -42.2, 28.1}, 5.1},
+					    {{31.2, 38.6, -34.2}, 5.1},  {{-5.7, -49.4, 45.9}, 5.1},
+					    {{8.6, -12.9, -3.1}, 5.1},   {{21.3, 25.3, -1.2}, 5.1},
+					    {{-31.7, -20.3, -8.4}, 5.1}, {{-33.9, 4.6, 0.3}, 5.1}};
+	struct ball copy[8];
+	const struct balls balls = {.count = 8, .ball = copy};
+	struct arm_scene scene = {.arm = arm_coarse};
+	struct calibration calibration;
+	struct error err = {0};
+
+	memcpy(copy, eight, sizeof(copy));
+	scene.target = (struct target){.balls = &balls, .ball = .5, .photons = 20000, .rays = 3};
+	ck_assert_msg(arm_calibrate(&scene.arm, arm_image, &scene, &balls, false, &calibration, &err) == 0, "%s",
+		      err.text);
+	for (int k = 0; k < calibration.count; k++)
+		ck_assert_msg(calibration.views[k].used, "view %d: %s", k, calibration.views[k].refused);
+	calibration_clear(&calibration);
 }
 END_TEST
 
@@ -322,11 +377,24 @@ static const struct {
 	int circles, balls, count;
 	double distance, height; /* of the circles; mm, of the phantom's middle */
 	double found, other;     /* mm: of the place that is taken, from where it stood; of another from there */
+	const char *told[2];     /* of balls, of the height; NULL: nothing */
 } heights[] = {
     {.circles = 4, .balls = 6, .distance = 12, .height = -4, .count = 28},
     {.circles = 3, .balls = 6, .distance = 22, .height = 0, .count = 30},
-    {.circles = 4, .balls = 8, .distance = 15, .height = 22, .count = 20},
-    {.circles = 4, .balls = 8, .distance = 15, .height = 10, .count = 20, .found = 15, .other = -15},
+    {.circles = 4,
+     .balls = 8,
+     .distance = 15,
+     .height = 22,
+     .count = 20,
+     .told = {"16 of the drawing's 32 balls, 16, 17, 18, "}},
+    {.circles = 4,
+     .balls = 8,
+     .distance = 15,
+     .height = 10,
+     .count = 20,
+     .found = 15,
+     .other = -15,
+     .told = {"8 of the drawing's 32 balls, 0, 1, 2, 3, 4, 5, 6, 7 (counted from 0), ", "15.0 mm lower along z"}},
 };
 
 START_TEST(of_like_circles_each_is_taken_for_itself)
@@ -344,6 +412,9 @@ START_TEST(of_like_circles_each_is_taken_for_itself)
 					  .sag = 1}};
 	struct balls balls, drawing;
 	struct calibration calibration;
+	cJSON *document, *doubts;
+	const cJSON *doubt;
+	const char *told[2] = {NULL};
 	struct error err = {0};
 
 	ck_assert(balls_circles(&drawing, &like, &err) == 0);
@@ -363,6 +434,22 @@ START_TEST(of_like_circles_each_is_taken_for_itself)
 				      arm_wrong(&scene.arm, k, view));
 	}
 	ck_assert_double_eq_tol(calibration.rival_height, heights[_i].other, 1e-6);
+	document = calibration_json(&calibration);
+	doubts = calibration_doubts(document);
+	cJSON_ArrayForEach(doubt, doubts)
+	{
+		const char *code = cJSON_GetObjectItem(doubt, "code")->valuestring;
+		const int of = strcmp(code, "calibration_height") == 0;
+
+		ck_assert(of || strcmp(code, "calibration_balls") == 0);
+		told[of] = cJSON_GetObjectItem(doubt, "detail")->valuestring;
+	}
+	for (int i = 0; i < 2; i++)
+		ck_assert_msg((told[i] != NULL) == (heights[_i].told[i] != NULL) &&
+				  (told[i] == NULL || strstr(told[i], heights[_i].told[i]) != NULL),
+			      "%s", told[i] != NULL ? told[i] : "nothing told");
+	cJSON_Delete(document);
+	cJSON_Delete(doubts);
 	calibration_clear(&calibration);
 	balls_clear(&balls);
 	balls_clear(&drawing);
@@ -376,6 +463,8 @@ Suite *calibrate_views_suite(void)
 
 	tcase_set_timeout(tests, 120);
 	tcase_add_test(tests, a_view_of_balls_in_a_plane_is_refused);
+	tcase_add_test(tests, too_many_views_that_fit_are_told_so);
+	tcase_add_test(tests, eight_balls_are_enough_in_all_views);
 	tcase_add_loop_test(tests, a_pose_that_fits_nearly_is_not_taken, 0, 3);
 	tcase_add_loop_test(tests, what_poses_between_neighbours_are_worth_is_told, 0, 2);
 	tcase_add_loop_test(tests, a_ball_more_or_less_is_told, 0, sizeof(presences) / sizeof(*presences));
