@@ -138,8 +138,11 @@ static struct exterior_rows look_at_rows(const struct exterior_volume_options *o
 	const struct outside_rows outside =
 	    outside_rows(options->grid, &geometry->views[view], columns, rows, measured);
 	const struct ends_known known = {options->orbit->pad, options->dense, view};
-	struct exterior_rows found = {
-	    .beside = outside.beside, .outside = outside.beside + outside.ends, .first = rows, .last = -1};
+	struct exterior_rows found = {.beside = outside.beside,
+				      .outside = outside.beside + outside.ends,
+				      .certain = outside.certain,
+				      .first = rows,
+				      .last = -1};
 
 	for (int r = 0; r < rows; r++)
 		if (is_truncated(&known, r, measured + (size_t)r * (size_t)columns, columns, largest, air)) {
@@ -159,7 +162,7 @@ static int rows_around(const struct orbit *orbit, int rows)
 int exterior_look(const struct exterior_volume_options *options, struct exterior_rows *ret_rows, struct error *err)
 {
 	const int all = options->geometry->rows, around = rows_around(options->orbit, all);
-	size_t truncated = 0, outside = 0, beside = 0;
+	size_t truncated = 0, outside = 0, beside = 0, certain = 0;
 	int first = all, last = -1;
 	struct exterior_rows found;
 	struct exterior_views views;
@@ -168,7 +171,7 @@ int exterior_look(const struct exterior_volume_options *options, struct exterior
 	if (code < 0)
 		return code;
 	while (exterior_views_next(&views, &code, err)) {
-#pragma omp parallel for schedule(static) reduction(+ : truncated, outside, beside) reduction(min : first)                     \
+#pragma omp parallel for schedule(static) reduction(+ : truncated, outside, beside, certain) reduction(min : first)                     \
     reduction(max : last)
 		for (int i = 0; i < views.here; i++) {
 			const struct exterior_rows rows = look_at_rows(options, exterior_views_index(&views, i),
@@ -177,6 +180,7 @@ int exterior_look(const struct exterior_volume_options *options, struct exterior
 			truncated += rows.truncated;
 			outside += rows.outside;
 			beside += rows.beside;
+			certain += rows.certain;
 			first = rows.first < first ? rows.first : first;
 			last = rows.last > last ? rows.last : last;
 		}
@@ -185,6 +189,7 @@ int exterior_look(const struct exterior_volume_options *options, struct exterior
 	found = (struct exterior_rows){.truncated = truncated,
 				       .outside = outside,
 				       .beside = beside,
+				       .certain = certain,
 				       .first = first - (last >= 0 ? around : 0),
 				       .last = last + (last >= 0 ? around : 0)};
 	if (code == 0 && found.outside == 0)

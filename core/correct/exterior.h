@@ -40,6 +40,7 @@ struct exterior_rows {
 	/* Truncated rows, from the first to the last in any view, those around them included; none: first > last. */
 	int first, last; /* exterior_look only */
 	size_t beside;   /* of `outside`, those with rays that miss the grid and are not air; exterior_look only */
+	size_t certain;  /* rows looked at that count something outside, whatever noise may be; exterior_look only */
 	/*
 	 * No row counts anything outside, but that cannot be excluded, for the rays through what may be there pass the
 	 * grid as well: the end of a body some mm beyond the grid's. exterior_look only.

@@ -220,7 +220,8 @@ static int apply(const struct correction_job *job, void *state, enum correction_
 		*job->settled = fmin(*job->settled, EXTERIOR_SETTLED);
 	if (rows.outside + rows.truncated > 0)
 		*job->outside = true;
-	if (code == 0)
+	/* Of few photons some rows are taken for such by chance, and what is taken out of them is noise. */
+	if (code == 0 && (seen.certain > 0 || exterior_volume_has_outside(exterior, options.grid)))
 		warn_of_outside(job, rows.outside);
 	if (code == 0 && taken)
 		exterior_volume_leave_device(exterior);

@@ -4,11 +4,14 @@
 #include <math.h>
 #include <stdlib.h>
 
+#include "core/select.h"
 #include "core/truncation.h"
 
 enum {
 	LOOKED_AT = 64, /* rays of a row, or rows of a view */
-	SHARE = 32      /* one ray in so many makes the row one that counts it */
+	SHARE = 32,     /* one ray in so many makes the row one that counts it */
+	END = 16,       /* columns at an end of a row */
+	APART = 2       /* since a detector's blur makes neighbours alike */
 };
 
 static const double OPEN_DENSITY = 0.25, OPEN_EXCESS = 0.02;
@@ -16,6 +19,14 @@ static const double OPEN_DENSITY = 0.25, OPEN_EXCESS = 0.02;
 static int stride_of(int columns)
 {
 	return columns > LOOKED_AT ? columns / LOOKED_AT : 1;
+}
+
+/* The i-th of about LOOKED_AT rows, the outermost ones among them. */
+static int row_looked_at(int i, int rows)
+{
+	const int looked_at = rows < LOOKED_AT ? rows : LOOKED_AT;
+
+	return looked_at > 1 ? (int)((long long)i * (rows - 1) / (looked_at - 1)) : 0;
 }
 
 /* The two axes that lie in a face across `axis`, the faster one in memory first. */
@@ -67,35 +78,88 @@ bool faces_row_counts_outside(const struct faces *faces, const struct view *view
 	return missed * SHARE > looked_at && beside > 0 && beside >= level * missed;
 }
 
+/*
+ * The deviation of noise in a view, by the lower quarter of second differences at both ends of its rows, where the
+ * object is in few.
+ */
+static double noise_beside(const float *measured, int columns, int rows)
+{
+	/* A quarter of |d| of normal noise of deviation s is below 0.3186 sqrt(6) s. */
+	const double quarter_of_one = 0.3186 * sqrt(6);
+	const int looked_at = rows < LOOKED_AT ? rows : LOOKED_AT, quarter = columns / 4;
+	const int least = quarter > 2 * APART ? quarter : 2 * APART + 1, end = least < END ? least : END;
+	float bends[LOOKED_AT * 2 * END];
+	int count = 0;
+
+	if (columns < end)
+		return 0;
+	for (int i = 0; i < looked_at; i++)
+		for (int side = 0; side < 2; side++) {
+			const float *p =
+			    measured + (size_t)row_looked_at(i, rows) * (size_t)columns + (side ? columns - end : 0);
+
+			for (int c = 0; c + 2 * APART < end; c++)
+				bends[count++] = fabsf(p[c] - 2 * p[c + APART] + p[c + 2 * APART]);
+		}
+	return (double)select_kth(bends, count, count / 4) / quarter_of_one;
+}
+
+/* Rays of a row. */
+struct rays {
+	int count;
+	double sum;
+};
+
+static void rays_add(struct rays *rays, double value)
+{
+	rays->sum += value;
+	rays->count++;
+}
+
+static bool rays_reach(const struct rays *rays, double level)
+{
+	return rays->sum > 0 && rays->sum >= level * rays->count;
+}
+
+/* More than noise makes of their mean in any of the thousands of rows of a scan. */
+static double rays_chance(const struct rays *rays, double noise)
+{
+	const double deviations = 5;
+
+	return deviations * noise / sqrt(fmax(1, rays->count));
+}
+
 struct outside_rows outside_rows(const struct grid *grid, const struct view *view, int columns, int rows,
 				 const float *measured)
 {
 	const int looked_at = rows < LOOKED_AT ? rows : LOOKED_AT;
 	const double level =
 	    (double)truncation_level_of_many(truncation_largest(measured, columns, rows, 1, (size_t)columns));
-	size_t beside = 0, ends = 0;
+	const double noise = noise_beside(measured, columns, rows);
+	struct outside_rows found = {0};
 
 	for (int i = 0; i < looked_at; i++) {
-		const int row = looked_at > 1 ? (int)((long long)i * (rows - 1) / (looked_at - 1)) : 0;
-		int missed = 0, passed = 0;
-		double missed_sum = 0, passed_sum = 0;
+		const int row = row_looked_at(i, rows);
+		struct rays missed = {0}, passed = {0};
+		bool beside, ends;
 
 		for (int column = 0; column < columns; column += stride_of(columns)) {
 			const struct grid_passage passage = grid_passage(grid, view, column, row);
 			const double p = (double)measured[(size_t)row * (size_t)columns + (size_t)column];
 
-			if (passage.missed) {
-				missed++;
-				missed_sum += p;
-			} else if (passage.axis[0] == 2 || passage.axis[1] == 2) {
-				passed++;
-				passed_sum += p;
-			}
+			if (passage.missed)
+				rays_add(&missed, p);
+			else if (passage.axis[0] == 2 || passage.axis[1] == 2)
+				rays_add(&passed, p);
 		}
-		beside += missed_sum > 0 && missed_sum >= level * missed;
-		ends += (row == 0 || row == rows - 1) && passed_sum > 0 && passed_sum >= level * passed;
+		beside = rays_reach(&missed, level);
+		ends = (row == 0 || row == rows - 1) && rays_reach(&passed, level);
+		found.beside += beside;
+		found.ends += ends;
+		found.certain += (beside && rays_reach(&missed, rays_chance(&missed, noise))) ||
+				 (ends && rays_reach(&passed, rays_chance(&passed, noise)));
 	}
-	return (struct outside_rows){beside, ends};
+	return found;
 }
 
 /* The outermost layers, and the density of what is in the volume. */

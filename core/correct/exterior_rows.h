@@ -49,6 +49,7 @@ bool faces_row_counts_outside(const struct faces *faces, const struct view *view
  */
 struct outside_rows {
 	size_t beside, ends;
+	size_t certain; /* rows of either whose mean is more than noise alone may be, in this or any other row */
 };
 struct outside_rows outside_rows(const struct grid *grid, const struct view *view, int columns, int rows,
 				 const float *measured);

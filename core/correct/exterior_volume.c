@@ -660,7 +660,7 @@ bool exterior_volume_has_outside(const struct exterior_volume *s, const struct g
 	/* Share of the object's density: 0.15 where a cylinder ends with the grid, 0.27 where it ends 0.4 mm beyond,
 	 * then more. */
 	const double density = 0.25;
-	const size_t least = 64; /* voxels, against noise */
+	const size_t least = 9; /* voxels, those of one mean: noise makes next to none, small things have few */
 	double squares = 0, sum = 0;
 	size_t count = 0;
 

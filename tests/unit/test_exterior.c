@@ -473,6 +473,45 @@ START_TEST(a_body_that_ends_a_little_beyond_the_grid_is_not_piled_up_at_its_face
 END_TEST
 
 /*
+ * Of small bodies a level of 5 % is less than noise, and of the thousands of rows some have more of it. What is small
+ * and goes on has few voxels beyond the grid.
+ */
+static struct ellipsoid pin_parts[] = {{SHAPE_CYLINDER, {3, 3, 14}, {12, 6, 2}, 0, .03}};
+static struct ellipsoid fingers_parts[] = {{SHAPE_CYLINDER, {6, 6, 20}, {-14, 0, 0}, 0, .0192},
+					   {SHAPE_CYLINDER, {6, 6, 16}, {14, 3, 0}, 0, .0192}};
+static struct ellipsoid high_parts[] = {{SHAPE_ELLIPSOID, {7, 7, 7}, {10, 4, 28}, 0, .03}};
+
+static const struct {
+	struct phantom phantom;
+	int across;     /* voxels of 3.6 mm in x; y has 26, z 17 */
+	double photons; /* of a pixel of air; 0: no noise */
+	bool told;
+} small_bodies[] = {
+    {{1, pin_parts}, 26, 2000, false}, {{2, fingers_parts}, 26, 2000, false}, {{1, high_parts}, 26, 0, true},
+    {{1, high_parts}, 26, 2e4, true},  {{2, fingers_parts}, 9, 5000, true},
+};
+
+START_TEST(noise_is_no_body_that_goes_on_outside_of_the_grid)
+{
+	const struct orbit_spec spec = {44, 36, 48, {620, 1100, {4, 4}, {0, 0}, {0, 0}}, 0, 7.5};
+	struct grid grid = grid_of(small_bodies[_i].across, 26, 17, 3.6, 3.6, 3.6);
+	struct recipe recipe = sart_on(&grid);
+	struct outcome outcome = {0};
+	struct scene scene;
+
+	scene_orbit(&scene, &spec);
+	scene_add(&scene, &small_bodies[_i].phantom);
+	if (small_bodies[_i].photons > 0)
+		add_noise(&scene, small_bodies[_i].photons);
+	run(&scene, &recipe, &outcome);
+	ck_assert_msg((strstr(outcome.warnings, "outside_grid: ") != NULL) == small_bodies[_i].told, "%s",
+		      outcome.warnings);
+	outcome_clear(&outcome);
+	scene_clear(&scene);
+}
+END_TEST
+
+/*
  * A tube 8 % below the flat keeps the ends of all rows from 0 in a scan that nothing is cut off in: FDK's means over
  * many columns in place of SART's made the end slices 160 HU wrong.
  */
@@ -974,6 +1013,7 @@ Suite *exterior_suite(void)
 			    2);
 	tcase_add_loop_test(tests, a_body_that_ends_a_little_beyond_the_grid_is_not_piled_up_at_its_faces, 0,
 			    COUNT(near_ends));
+	tcase_add_loop_test(tests, noise_is_no_body_that_goes_on_outside_of_the_grid, 0, COUNT(small_bodies));
 	tcase_add_test(tests, a_tube_that_gives_less_is_not_taken_for_a_body_that_is_cut_off);
 	tcase_add_test(tests, blank_views_are_not_taken_for_air);
 	tcase_add_loop_test(bits, the_same_bits_with_other_threads_after_a_yield_and_in_just_the_memory_that_was_said,
