@@ -293,7 +293,9 @@ static void tell_misfit(const struct run *run, double turn, double residual, cha
 	int balls;
 
 	if (residual > RMS_MOST) {
-		snprintf(text, size, "do not fit this phantom, at a mean residual of %.2f pixels", residual);
+		snprintf(text, size,
+			 "do not fit this phantom: what comes nearest leaves a residual of %.2f pixels in the mean",
+			 residual);
 	} else if (residual > 0) {
 		snprintf(text, size, "cannot be used, expected at most %.0f %%, though poses fit them to %.2f pixels",
 			 100 * (1 - USED_LEAST), residual);

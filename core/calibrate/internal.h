@@ -128,8 +128,8 @@ int match_view(const struct match_view *view, const double pixel_mm[2], const st
 int match_pose(const struct match_view *view, const struct pose *pose, const double pixel_mm[2],
 	       const struct balls *balls, double reach, struct pair *ret_pairs);
 /*
- * The angle about z by which the phantom stood turned: of those under which about as many balls of some views have
- * shadows as under any, the smallest.
+ * The angle about z by which the phantom stood turned, to a few degrees: of those under which poses explain about as
+ * many balls' shadows of some views as under any, the smallest.
  */
 int match_turn(const struct match_view *views, int count, const double pixel_mm[2], const struct balls *balls,
 	       double *ret_turn, struct error *err);

@@ -19,6 +19,7 @@ enum { BINS_MOST = 96, TURN_STEPS = 120, TURN_VIEWS = 8 };
 static const double SHIFT_MOST = .25;             /* of the detector's longer side, to either side */
 static const double REACHES[] = {6, 4.5, 3.5, 3}; /* mm at the detector */
 static const double TURN_LIKE_BEST = .8;          /* of the pairs of the best turn */
+static const double TURN_AS_GOOD = .9;            /* of the pairs that poses explain at the best turn */
 
 struct expected {
 	double pixel[2], radius; /* radius 0: not in front of the source */
@@ -310,11 +311,61 @@ static int climb(const int pairs[TURN_STEPS], int turn)
 	return turn;
 }
 
+/* How many shadows of a view one pose explains, the phantom turned by an angle. */
+static int explained(const struct match_view *view, const double pixel_mm[2], const struct balls *balls, double turn)
+{
+	struct pair pairs[BALLS_MOST];
+	struct pose pose;
+	int count = match_view(view, pixel_mm, balls, turn, pairs);
+
+	pulse_beat();
+	if (count < PAIRS_LEAST || resect(balls, pairs, count, pixel_mm, 0, &pose, &count) < 0 ||
+	    pose_fit(&pose, pixel_mm, balls, pairs, count) > RMS_MOST)
+		return 0;
+	return count;
+}
+
+/* The smallest of the turns at which about as many, by a share, are found as at any. */
+static int smallest_turn(const int found[TURN_STEPS], double share)
+{
+	int most = 0, best = 0;
+
+	for (int t = 0; t < TURN_STEPS; t++)
+		most = found[t] > most ? found[t] : most;
+	for (int t = 0; t < TURN_STEPS; t++)
+		if (found[t] >= share * most && abs(t - TURN_STEPS / 2) < abs(best - TURN_STEPS / 2))
+			best = t;
+	return best;
+}
+
+/*
+ * Among many balls there are pairs at any turn: of the turns that have more than those beside them, and about as many
+ * as any, those count of which poses explain the pairs.
+ */
+static int explained_turn(const struct match_view *views, int count, int used, const double pixel_mm[2],
+			  const struct balls *balls, const int pairs[TURN_STEPS])
+{
+	int found[TURN_STEPS] = {0}, most = 0, any = 0;
+
+	for (int t = 0; t < TURN_STEPS; t++)
+		most = pairs[t] > most ? pairs[t] : most;
+#pragma omp parallel for schedule(dynamic) reduction(+ : any)
+	for (int t = 0; t < TURN_STEPS; t++) {
+		if (pairs[t] < TURN_LIKE_BEST * most || climb(pairs, t) != t)
+			continue;
+		for (int i = 0; i < used; i++)
+			found[t] += explained(&views[(2 * i + 1) * count / (2 * used)], pixel_mm, balls,
+					      2 * M_PI * (t - TURN_STEPS / 2) / TURN_STEPS);
+		any += found[t];
+	}
+	return any > 0 ? smallest_turn(found, TURN_AS_GOOD) : climb(pairs, smallest_turn(pairs, TURN_LIKE_BEST));
+}
+
 int match_turn(const struct match_view *views, int count, const double pixel_mm[2], const struct balls *balls,
 	       double *ret_turn, struct error *err)
 {
 	const int used = count < TURN_VIEWS ? count : TURN_VIEWS;
-	int pairs[TURN_STEPS] = {0}, most = 0, best = 0, failed = 0;
+	int pairs[TURN_STEPS] = {0}, best, failed = 0;
 
 #pragma omp parallel for schedule(dynamic)
 	for (int t = 0; t < TURN_STEPS; t++) {
@@ -336,12 +387,7 @@ int match_turn(const struct match_view *views, int count, const double pixel_mm[
 	}
 	if (failed)
 		return error_set(err, ERR_NO_MEMORY, "no memory to match %d balls", balls->count);
-	for (int t = 0; t < TURN_STEPS; t++)
-		most = pairs[t] > most ? pairs[t] : most;
-	for (int t = 0; t < TURN_STEPS; t++)
-		if (pairs[t] >= TURN_LIKE_BEST * most && abs(t - TURN_STEPS / 2) < abs(best - TURN_STEPS / 2))
-			best = t;
-	best = climb(pairs, best);
+	best = explained_turn(views, count, used, pixel_mm, balls, pairs);
 	*ret_turn = 2 * M_PI * (best - TURN_STEPS / 2) / TURN_STEPS;
 	return 0;
 }
