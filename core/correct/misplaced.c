@@ -50,13 +50,14 @@ static bool is_on(enum side side, int axis, int strip, int sample, int samples)
 	return side != NO_SIDE && at == (side == FIRST_COLUMNS || side == FIRST_ROWS ? 0 : NARROW_STRIPS - 1);
 }
 
-/* How far a view's strips, but for one side of the detector, are off what lies between those of two others: the squared
- * mean, so that little of a view, as a plate seen from its edge, counts for little. */
-static double between(const struct search *search, int view, int before, int behind, double share, enum side without)
+/* How far a view's strips, but for one side of the detector, are off what lies between those of two others and a level:
+ * the squared mean, so that little of a view, as a plate seen from its edge, counts for little. */
+static double beside_level(const struct search *search, int view, int before, int behind, double share,
+			   enum side without, float level, float *ret_level)
 {
 	const struct view_strips *v = &search->strips[view], *a = &search->strips[before], *b = &search->strips[behind];
 	const float part = (float)share;
-	double sum = 0;
+	double sum = 0, all = 0;
 	int count = 0;
 
 	for (int axis = 0; axis < 2; axis++)
@@ -67,10 +68,29 @@ static double between(const struct search *search, int view, int before, int beh
 
 				if (isnan(off) || is_on(without, axis, s, i, search->samples[axis]))
 					continue;
-				sum += (double)fabsf(off);
+				sum += (double)fabsf(off - level);
+				all += (double)off;
 				count++;
 			}
+	*ret_level = count > 0 ? (float)(all / count) : 0;
 	return count > 0 ? pow(sum / count, 2) : INFINITY;
+}
+
+static double between(const struct search *search, int view, int before, int behind, double share, enum side without)
+{
+	float level;
+
+	return beside_level(search, view, before, behind, share, without, 0, &level);
+}
+
+/* The same, or what is left without the level that all of the view is off by, if that is less. */
+static double between_whatever_level(const struct search *search, int view, int before, int behind, double share,
+				     enum side without)
+{
+	float level, rest;
+	const double off = beside_level(search, view, before, behind, share, without, 0, &level);
+
+	return fmin(off, beside_level(search, view, before, behind, share, without, level, &rest));
 }
 
 static double apart_of(const struct search *search, int a, int b)
@@ -422,18 +442,30 @@ static int beside(const struct search *search, int place, int side)
 	return -1;
 }
 
+/*
+ * True where a full turn closes between two places: views of its beginning and of its end stand beside each other
+ * there, and the tube may have given more or less in between.
+ */
+static bool closes(const struct search *search, int before, int behind)
+{
+	return 2 * abs(search->ring->places[before].view - search->ring->places[behind].view) > search->ring->count;
+}
+
 /* How far a view would lie off at a place, as if the views beside it stood next to it; INFINITY: not known. */
 static double off_at(const struct search *search, int view, int place, int before, int behind, enum side without)
 {
 	const struct ring *ring = search->ring;
-	double from, to;
+	double from, to, off;
 
 	if (before < 0 || behind < 0 || before == behind)
 		return INFINITY;
 	from = ring_turn(ring, before, place);
 	to = ring_turn(ring, place, behind);
-	return between(search, view, search->views[before], search->views[behind], from / (from + to), without) /
-	       fmax(1, pow(from * to / (search->gap * search->gap), 2));
+	off = closes(search, before, behind)
+		  ? between_whatever_level(search, view, search->views[before], search->views[behind],
+					   from / (from + to), without)
+		  : between(search, view, search->views[before], search->views[behind], from / (from + to), without);
+	return off / fmax(1, pow(from * to / (search->gap * search->gap), 2));
 }
 
 /* At its own place: the least of three, so that one view beside it may be wrong. */

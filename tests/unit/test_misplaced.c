@@ -150,6 +150,43 @@ START_TEST(the_end_of_a_board_that_leaves_the_detector_misplaces_no_view)
 }
 END_TEST
 
+/*
+ * A tube that gives less and less: where a full turn closes, the first view and the last one stand beside each other. A
+ * rod looks alike from many sides.
+ */
+START_TEST(a_tube_whose_output_falls_misplaces_no_view)
+{
+	const int views = _i == 0 ? 117 : 60;
+	const struct orbit_spec spec = spec_of(views, 0, 360. / views);
+	const double fall = .1, photons = 20000;
+	struct ellipsoid rod[] = {
+	    {.shape = SHAPE_CYLINDER, .semi_axes = {4, 4, 24}, .centre = {6, 4, 0}, .density = .0288}};
+	const struct phantom phantom = {.count = 1, .parts = rod};
+	const struct grid grid = grid_of(12, 12, 6, 6, 6, 6);
+	struct recipe recipe = recipe_on(&grid);
+	struct outcome outcome = {0};
+	struct scene scene;
+	unsigned short seed[3] = {3, 0, 0};
+
+	recipe.fdk.on = true;
+	scene_orbit(&scene, &spec);
+	scene_add(&scene, &phantom);
+	for (int k = 0; k < views; k++)
+		for (int i = 0; i < PIXELS; i++) {
+			float *p = &scene.projections[k * PIXELS + i];
+			const double seen = (1 - fall * k / (views - 1)) * exp(-(double)*p);
+			const double gauss = sqrt(-2 * log(1 - erand48(seed))) * cos(2 * M_PI * erand48(seed));
+
+			*p = (float)-log(seen + sqrt(seen / photons) * gauss);
+		}
+	run(&scene, &recipe, &outcome);
+	ck_assert_msg(strstr(outcome.warnings, "misplaced_views") == NULL, "%s", outcome.warnings);
+	ck_assert_msg(strstr(outcome.warnings, "air_level") != NULL, "%s", outcome.warnings);
+	outcome_clear(&outcome);
+	scene_clear(&scene);
+}
+END_TEST
+
 Suite *misplaced_suite(void)
 {
 	Suite *suite = suite_create("misplaced");
@@ -159,6 +196,7 @@ Suite *misplaced_suite(void)
 	tcase_add_loop_test(tests, exchanged_views_are_put_in_their_places, 0, ROWS_OF_TEST);
 	tcase_add_loop_test(tests, the_end_of_a_board_that_leaves_the_detector_misplaces_no_view, 0,
 			    sizeof(tables) / sizeof(*tables));
+	tcase_add_loop_test(tests, a_tube_whose_output_falls_misplaces_no_view, 0, 2);
 	suite_add_tcase(suite, tests);
 	return suite;
 }
