@@ -21,8 +21,8 @@ static bool is_seen(const struct grid *grid, const struct geometry *geometry)
 			for (int a = 0; a < 3; a++)
 				place[a] =
 				    grid->origin[a] + grid->spacing[a] * (grid->size[a] - 1) * steps[a] / (ALONG - 1);
-			if (view_project(matrix, place, &column, &row) > 0 && column >= 0 && row >= 0 &&
-			    column <= geometry->columns - 1 && row <= geometry->rows - 1)
+			if (view_project(matrix, place, &column, &row) > 0 && column >= -0.5 && row >= -0.5 &&
+			    column <= geometry->columns - 0.5 && row <= geometry->rows - 0.5)
 				return true;
 		}
 	}

@@ -133,11 +133,12 @@ struct geometry orbit_sides(const struct orbit *orbit, const struct geometry *ge
 
 /*
  * A grid where none is given: cubic voxels at the resolution of the detector at the isocentre, coarsened so that no
- * side has more than `most` voxels; across, the field of view, and along z all slices in which every view has the
- * whole field of view on its rows, not centred where the detector is not. One slice, where its plane meets the axis,
- * for a detector of one row. An orbit that leans so far that this leaves less than half of the height gets the largest
- * box whose part of the field of view all views see, narrower along the lean, and one whose views have next to no
- * height in common the grid of orbit_covering_grid: orbit_unseen_slices counts what some views do not see.
+ * side has more than `most` voxels, their slices where rows meet the axis and as high as those where they are higher;
+ * across, the field of view, and along z all slices in which every view has the whole field of view on its rows, not
+ * centred where the detector is not. One slice, where its plane meets the axis, for a detector of one row. An orbit
+ * that leans so far that this leaves less than half of the height gets the largest box whose part of the field of view
+ * all views see, narrower along the lean, and one whose views have next to no height in common the grid of
+ * orbit_covering_grid: orbit_unseen_slices counts what some views do not see.
  */
 void orbit_default_grid(const struct orbit *orbit, const struct geometry *geometry, int most, struct grid *ret_grid);
 /*

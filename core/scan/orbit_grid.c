@@ -216,18 +216,24 @@ static double middle_row_on_axis(const struct orbit *orbit, const struct geometr
  * (tests/bench/results/denoise.txt).
  */
 static void lay_slices_on_rows(const struct orbit *orbit, const struct geometry *geometry, double low, double high,
-			       struct grid *grid)
+			       int most, struct grid *grid)
 {
-	const double spacing = grid->spacing[2], rounding = 1e-6;
+	const double spacing = grid->spacing[2];
 	const double row = middle_row_on_axis(orbit, geometry) * orbit->frame[2][2];
 	const double slice = row + (geometry->rows % 2 ? 0 : 0.5 * spacing);
-	const double first = ceil((low - slice) / spacing - rounding),
-		     last = floor((high - slice) / spacing + rounding);
+	/* Two rows have no slice on one of them in what all views see but for a part of a row (is_seen_by_all). */
+	static const double beyond[] = {1e-6, 0.25};
 
-	if (!(last >= first && last - first < grid->size[2]))
-		return;
-	grid->size[2] = (int)(last - first) + 1;
-	grid->origin[2] = slice + first * spacing;
+	for (int i = 0; i < 2; i++) {
+		const double first = ceil((low - slice) / spacing - beyond[i]);
+		const double last = floor((high - slice) / spacing + beyond[i]);
+
+		if (last >= first && last - first < most) {
+			grid->size[2] = (int)(last - first) + 1;
+			grid->origin[2] = slice + first * spacing;
+			return;
+		}
+	}
 }
 
 void orbit_default_grid(const struct orbit *orbit, const struct geometry *given, int most, struct grid *ret_grid)
@@ -252,14 +258,20 @@ void orbit_default_grid(const struct orbit *orbit, const struct geometry *given,
 		sides[i] = high[i] - low[i];
 	spacing = voxel_spacing(orbit, geometry, sides, most);
 	for (int i = 0; i < 3; i++) {
+		/*
+		 * Slices are as high as rows, where those are higher than columns are wide: of finer ones each row lies
+		 * elsewhere between two.
+		 */
+		const bool high_rows = i == 2 && orbit->lean == 0 && geometry->rows > 1;
+		const double mm = high_rows ? fmax(spacing, orbit->pixel_at_isocentre[1]) : spacing;
 		/* The outermost centres along z are inside of the range; a part of a millionth is rounding. */
-		const double voxels = i == 2 ? floor(sides[i] / spacing + 1e-6) + 1 : ceil(sides[i] / spacing - 1e-6);
+		const double voxels = i == 2 ? floor(sides[i] / mm + 1e-6) + 1 : ceil(sides[i] / mm - 1e-6);
 
 		grid.size[i] = (int)fmin(most, fmax(1, voxels));
-		grid.spacing[i] = spacing;
-		grid.origin[i] = 0.5 * (low[i] + high[i]) - 0.5 * (grid.size[i] - 1) * spacing;
+		grid.spacing[i] = mm;
+		grid.origin[i] = 0.5 * (low[i] + high[i]) - 0.5 * (grid.size[i] - 1) * mm;
 	}
-	lay_slices_on_rows(orbit, geometry, low[2], high[2], &grid);
+	lay_slices_on_rows(orbit, geometry, low[2], high[2], most, &grid);
 	if (grid_check_geometry(&grid, given, &err) == 0)
 		*ret_grid = grid;
 }

@@ -288,20 +288,24 @@ END_TEST
 
 /*
  * Flat bodies of water on few rows, all by default, the grid as well. Of slices between two rows iterations raised what
- * alternates from slice to slice, without end: 178 and 279 HU where FDK has 101 and 120.
+ * alternates from slice to slice, without end: 168, 205 and 266 HU where FDK has 81 to 88. So they did of slices that
+ * are less high than rows, and of the only one that was between the only two rows.
  */
 START_TEST(flat_bodies_on_the_automatic_grid_are_no_worse_than_fdk)
 {
 	static const struct {
 		double radius, half_height;
 		int rows;
-	} bodies[] = {{75, 17, 25}, {40, 17, 25}, {75, 15, 24}};
+		double height; /* of a row, mm */
+	} bodies[] = {
+	    {75, 17, 25, 5.77}, {40, 17, 25, 5.77}, {75, 15, 24, 5.77}, {62, 25, 24, 6.35}, {62, 100, 2, 5.77}};
 	struct ellipsoid part[] = {
 	    {SHAPE_CYLINDER, {bodies[_i].radius, bodies[_i].radius, bodies[_i].half_height}, {0, 0, 0}, 0, .0192},
 	};
 	const struct phantom body = {1, part};
 	/* Four rays a pixel. */
-	const struct orbit_spec spec = {96, 2 * bodies[_i].rows, 60, {470, 730, {2.885, 2.885}, {0, 0}, {0, 0}}, 0, 6};
+	const struct orbit_spec spec = {
+	    96, 2 * bodies[_i].rows, 60, {470, 730, {2.885, bodies[_i].height / 2}, {0, 0}, {0, 0}}, 0, 6};
 	struct outcome outcome = {.threads = 1};
 	int emit[] = {EMIT_FDK};
 	struct recipe recipe;
@@ -504,7 +508,7 @@ Suite *averaging_suite(void)
 	tcase_add_test(decision, without_structure_nothing_is_decided);
 	tcase_add_loop_test(decision, iterations_of_a_skull_on_coarse_voxels_are_no_worse_than_fdk, 0,
 			    sizeof(skulls) / sizeof(skulls[0]));
-	tcase_add_loop_test(edges, flat_bodies_on_the_automatic_grid_are_no_worse_than_fdk, 0, 3);
+	tcase_add_loop_test(edges, flat_bodies_on_the_automatic_grid_are_no_worse_than_fdk, 0, 5);
 	tcase_add_test(edges, fdk_s_blur_is_known_beside_a_voxel_s);
 	tcase_add_loop_test(edges, edges_that_fdk_shows_as_well_are_the_mean_of_both, 0, 2);
 	tcase_add_test(decision, the_default_averages_what_is_not_made_of_voxels);

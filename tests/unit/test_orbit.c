@@ -977,15 +977,26 @@ START_TEST(slices_of_a_default_grid_lie_on_rows)
 	    {48, 25, 5.77, 0, 6, 60, {0, 0}, 0},      {48, 24, 5.77, 0, 6, 60, {0, 0}, 0},
 	    {64, 37, 2, 0, 6, 60, {0, .7}, 0},        {64, 36, 2, 0, 6, 60, {0, -1.2}, 0},
 	    {160, 100, 2, 40, -1.8, 115, {0, .5}, 0}, {160, 101, 2, 0, 1.5, 240, {-90, 25.3}, 0},
+	    {48, 2, 5.77, 0, 6, 60, {0, 0}, 0},
 	};
 
-	for (size_t i = 0; i < sizeof(sweeps) / sizeof(*sweeps); i++) {
-		struct geometry geometry = geometry_of(&sweeps[i], NULL);
-		struct orbit orbit = orbit_of(&geometry);
+	for (size_t i = 0; i < 2 * sizeof(sweeps) / sizeof(*sweeps); i++) {
+		struct geometry geometry = geometry_of(&sweeps[i / 2], NULL);
+		const double higher = i % 2 == 0 ? 0 : 0.2;
+		struct orbit orbit;
 		struct grid grid;
 
+		for (int k = 0; k < geometry.count; k++)
+			for (int a = 0; a < 3; a++) {
+				double *step = &geometry.views[k].row_step[a];
+
+				geometry.views[k].pixel0[a] -= 0.5 * (geometry.rows - 1) * higher * *step;
+				*step *= 1 + higher;
+			}
+		orbit = orbit_of(&geometry);
+
 		orbit_default_grid(&orbit, &geometry, 1024, &grid);
-		ck_assert_int_gt(grid.size[2], 8);
+		ck_assert_int_ge(grid.size[2], geometry.rows / 2);
 		for (int slice = 0; slice < grid.size[2]; slice++) {
 			const double place[3] = {0, 0, grid.origin[2] + slice * grid.spacing[2]};
 			double matrix[12], column, row;

@@ -1115,8 +1115,9 @@ END_TEST
 
 START_TEST(a_grid_beside_every_view_is_told)
 {
+	struct orbit_spec row = small_orbit;
 	struct recipe recipe = small_recipe();
-	struct scene scene;
+	struct scene scene, slit;
 	struct outcome outcome = {0}, touched = {0};
 
 	small_scene(&scene); /* 44 rows, 1.64 mm apart at the isocentre */
@@ -1130,12 +1131,22 @@ START_TEST(a_grid_beside_every_view_is_told)
 	run(&scene, &recipe, &touched);
 	ck_assert_ptr_null(strstr(touched.warnings, "grid_unseen: "));
 	outcome_clear(&outcome);
+	outcome_clear(&touched);
+	touched = (struct outcome){0};
+	/* one slice that is within all views' only row, beside its middle */
+	row.rows = 1;
+	scene_orbit(&slit, &row);
+	recipe.grid = grid_of(20, 20, 1, 2, 2, 1.64);
+	recipe.grid.origin[2] = 0.3 * 1.64;
+	run(&slit, &recipe, &touched);
+	ck_assert_ptr_null(strstr(touched.warnings, "grid_unseen: "));
+	outcome_clear(&touched);
+	scene_clear(&slit);
 	/* a slice between two rows of pixels */
 	recipe.grid = grid_of(20, 20, 1, 2, 2, 0.5);
 	run(&scene, &recipe, &outcome);
 	ck_assert_ptr_nonnull(strstr(outcome.warnings, "grid_unseen: every ray"));
 	outcome_clear(&outcome);
-	outcome_clear(&touched);
 	scene_clear(&scene);
 }
 END_TEST
