@@ -9,10 +9,14 @@
  *     shadows are there of no ball;
  *   - of places that explain as much the one nearest to the nominal geometry is taken, and that there are others is
  *     told.
+ *
+ * Where a sweep jumps along the axis, or its end does not meet its beginning, a chain may go on a circle aside. The
+ * views behind that stand where they surely explain more.
  */
 #include <math.h>
 #include <stdio.h>
 #include <stdlib.h>
+#include <string.h>
 
 #include "core/calibrate/internal.h"
 #include "core/pulse.h"
@@ -37,6 +41,9 @@ struct placing {
 	const struct run *run;
 	struct stance *stances; /* [count] */
 	struct chain *chains;   /* [chain_count] */
+	int *missed;            /* [stance][motion], of the chain that is settled: what is not explained there */
+	int *before;            /* [stance][motion], the view before's motion of the cheapest way there */
+	int *motion;            /* [stance] of that chain */
 	int count, chain_count;
 	double axis[2]; /* mm, of the arm's turn, in the drawing's world */
 };
@@ -117,19 +124,26 @@ static void chain_view(struct placing *placing, int at)
 }
 
 /* What a chain's views do not explain, moved further, over all of them. */
-static int unexplained(const struct placing *placing, int chain, const struct motion *further)
+static int unexplained(const struct placing *placing, int chain, int motion)
 {
+	const struct motions *motions = &placing->run->motions;
 	int sum = 0;
 
 #pragma omp parallel for schedule(dynamic) reduction(+ : sum)
 	for (int i = 0; i < placing->count; i++) {
 		const struct stance *stance = &placing->stances[i];
+		int *missed = placing->missed + (size_t)i * (size_t)motions->count;
 		struct pose pose;
 
 		if (stance->chain != chain)
 			continue;
-		pose = moved(stance, further);
-		sum += presence_unexplained(placing->run, stance->view, &pose);
+		if (motion > 0 && motions->motion[motion].whole) {
+			missed[motion] = missed[0];
+		} else {
+			pose = moved(stance, &motions->motion[motion]);
+			missed[motion] = presence_unexplained(placing->run, stance->view, &pose);
+		}
+		sum += missed[motion];
 	}
 	return sum;
 }
@@ -154,8 +168,18 @@ static double aside(const struct placing *placing, int chain, const struct motio
 	return squares / placing->chains[chain].count;
 }
 
-/* Tells of the other places that explain as much: the next one about z, and the next one along it. */
-static void tell_rivals(struct calibration *calibration, const struct motions *motions, const bool *equal, int own)
+/* True if so much more is not explained that it is not by chance. */
+static bool is_surely_more(int missed, int least)
+{
+	return missed - least > SURE * sqrt(missed + least);
+}
+
+/*
+ * Tells of the other places that explain as much as the views do where they stand: the next one about z, and the next
+ * one along it.
+ */
+static void tell_rivals(struct calibration *calibration, const struct motions *motions, const int *missed, int own,
+			int least)
 {
 	double turn = INFINITY, along = INFINITY;
 
@@ -163,7 +187,7 @@ static void tell_rivals(struct calibration *calibration, const struct motions *m
 		const double further = motions->motion[m].along - motions->motion[own].along;
 		const double round = remainder(motions->motion[m].turn - motions->motion[own].turn, 2 * M_PI);
 
-		if (m == own || !equal[m])
+		if (m == own || is_surely_more(missed[m], least))
 			continue;
 		if (motions->motion[m].along == motions->motion[own].along) {
 			if (fabs(round) < fabs(turn))
@@ -176,32 +200,95 @@ static void tell_rivals(struct calibration *calibration, const struct motions *m
 	calibration->rival_height = isfinite(along) ? along : 0;
 }
 
-/* The place of a chain's views; tells of others that explain as much. */
-static struct motion settle(const struct placing *placing, int chain)
+/* The place of a chain's views, one of the drawing's motions; and what is not explained in each. */
+static int settle(const struct placing *placing, int chain, int ret_missed[MOTIONS_MOST])
 {
 	const struct motions *motions = &placing->run->motions;
-	int missed[MOTIONS_MOST], least, own = 0;
-	bool equal[MOTIONS_MOST];
 	double near = INFINITY;
+	int least = 0, own = 0;
 
 	for (int m = 0; m < motions->count; m++) {
-		missed[m] =
-		    m > 0 && motions->motion[m].whole ? missed[0] : unexplained(placing, chain, &motions->motion[m]);
-		least = m == 0 || missed[m] < least ? missed[m] : least;
+		ret_missed[m] = unexplained(placing, chain, m);
+		least = m == 0 || ret_missed[m] < least ? ret_missed[m] : least;
 		pulse_beat();
 	}
 	for (int m = 0; m < motions->count; m++) {
-		double from;
+		const double from =
+		    is_surely_more(ret_missed[m], least) ? INFINITY : aside(placing, chain, &motions->motion[m]);
 
-		equal[m] = missed[m] - least <= SURE * sqrt(missed[m] + least);
-		from = equal[m] ? aside(placing, chain, &motions->motion[m]) : INFINITY;
 		if (from < near) {
 			near = from;
 			own = m;
 		}
 	}
-	tell_rivals(placing->run->calibration, motions, equal, own);
-	return motions->motion[own];
+	return own;
+}
+
+/* What it costs to stand elsewhere than another motion: of places that explain as much the nearest is taken. */
+static double way_between(const struct motion *a, const struct motion *b)
+{
+	return 1e-6 * (fabs(a->along - b->along) + fabs(remainder(a->turn - b->turn, 2 * M_PI)));
+}
+
+/*
+ * The motion of each view of a chain, [stance]: the cheapest way through the sweep from the chain's own place on, by
+ * what is not explained and by changes from a view to the next, each of which costs what is more than chance. Returns
+ * what is not explained.
+ */
+static int follow_evidence(const struct placing *placing, int chain, int own, int *ret_motion)
+{
+	const struct motions *motions = &placing->run->motions;
+	double cost[MOTIONS_MOST], change;
+	int in_no_place = 0, last = -1, best = own, sum = 0;
+
+	for (int i = 0; i < placing->count; i++) {
+		const int *missed = placing->missed + (size_t)i * (size_t)motions->count;
+		int least = missed[0];
+
+		for (int m = 1; m < motions->count && placing->stances[i].chain == chain; m++)
+			least = missed[m] < least ? missed[m] : least;
+		in_no_place += placing->stances[i].chain == chain ? least : 0;
+	}
+	change = SURE * SURE + SURE * sqrt(in_no_place);
+	for (int m = 0; m < motions->count; m++)
+		cost[m] = m == own ? 0 : change + way_between(&motions->motion[m], &motions->motion[own]);
+	for (int i = 0; i < placing->count; i++) {
+		const size_t row = (size_t)i * (size_t)motions->count;
+		double next[MOTIONS_MOST];
+
+		if (placing->stances[i].chain != chain)
+			continue;
+		for (int m = 0; m < motions->count; m++) {
+			int from = m;
+			double least = cost[m];
+
+			for (int k = 0; k < motions->count && last >= 0; k++) {
+				const double way =
+				    cost[k] + change + way_between(&motions->motion[k], &motions->motion[m]);
+
+				if (k != m && way < least) {
+					least = way;
+					from = k;
+				}
+			}
+			placing->before[row + m] = from;
+			next[m] = least + placing->missed[row + m];
+		}
+		memcpy(cost, next, (size_t)motions->count * sizeof(*cost));
+		last = i;
+	}
+	for (int m = 0; m < motions->count; m++)
+		best = cost[m] < cost[best] ? m : best;
+	for (int i = last; i >= 0; i--) {
+		const size_t row = (size_t)i * (size_t)motions->count;
+
+		if (placing->stances[i].chain != chain)
+			continue;
+		ret_motion[i] = best;
+		sum += placing->missed[row + best];
+		best = placing->before[row + best];
+	}
+	return sum;
 }
 
 /* All views that are used, in the order of the sweep. */
@@ -252,19 +339,21 @@ static int find_axis(struct placing *placing, struct error *err)
 static void decide(struct placing *placing, double *turn, struct pose *poses, bool *is_moved)
 {
 	struct calibration *calibration = placing->run->calibration;
-	struct motion further;
-	int longest = 0;
+	const struct motions *motions = &placing->run->motions;
+	int missed[MOTIONS_MOST], longest = 0, own;
 
 	for (int i = 0; i < placing->count; i++)
 		chain_view(placing, i);
 	for (int c = 1; c < placing->chain_count; c++)
 		longest = placing->chains[c].count > placing->chains[longest].count ? c : longest;
-	further = settle(placing, longest);
-	*turn = remainder(*turn - further.turn, 2 * M_PI);
+	own = settle(placing, longest, missed);
+	tell_rivals(calibration, motions, missed, own, follow_evidence(placing, longest, own, placing->motion));
+	*turn = remainder(*turn - motions->motion[own].turn, 2 * M_PI);
 	for (int i = 0; i < placing->count; i++) {
 		const struct stance *stance = &placing->stances[i];
 		struct calibrated_view *view = &calibration->views[stance->view];
-		const struct motion motion = sum_of(&stance->motion, &further);
+		const struct motion *further;
+		struct motion motion;
 
 		if (stance->chain != longest) {
 			view->used = false;
@@ -274,8 +363,10 @@ static void decide(struct placing *placing, double *turn, struct pose *poses, bo
 				 placing->chains[longest].count, placing->count);
 			continue;
 		}
+		further = &motions->motion[placing->motion[i]];
+		motion = sum_of(&stance->motion, further);
 		is_moved[stance->view] = motion.turn != 0 || motion.along != 0;
-		poses[stance->view] = moved(stance, &further);
+		poses[stance->view] = moved(stance, further);
 	}
 }
 
@@ -285,12 +376,16 @@ int place_views(struct run *run, double *turn, struct error *err)
 	struct station *stations = stations_of(run->request->nominal);
 	struct placing placing = {.run = run,
 				  .stances = malloc((size_t)count * sizeof(*placing.stances)),
-				  .chains = malloc((size_t)count * sizeof(*placing.chains))};
+				  .chains = malloc((size_t)count * sizeof(*placing.chains)),
+				  .missed = malloc((size_t)count * (size_t)run->motions.count * sizeof(int)),
+				  .before = malloc((size_t)count * (size_t)run->motions.count * sizeof(int)),
+				  .motion = malloc((size_t)count * sizeof(int))};
 	struct pose *poses = malloc((size_t)count * sizeof(*poses));
 	bool *is_moved = calloc((size_t)count, sizeof(*is_moved));
 	int code = 0;
 
-	if (stations == NULL || placing.stances == NULL || placing.chains == NULL || poses == NULL || is_moved == NULL)
+	if (stations == NULL || placing.stances == NULL || placing.chains == NULL || placing.missed == NULL ||
+	    poses == NULL || is_moved == NULL)
 		code = error_set(err, ERR_NO_MEMORY, "no memory for %d views", count);
 	else
 		take_stances(&placing, stations);
@@ -304,6 +399,9 @@ int place_views(struct run *run, double *turn, struct error *err)
 	free(stations);
 	free(placing.stances);
 	free(placing.chains);
+	free(placing.missed);
+	free(placing.before);
+	free(placing.motion);
 	free(poses);
 	free(is_moved);
 	return code;

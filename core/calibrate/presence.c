@@ -9,6 +9,8 @@
 static const double CLEARANCE = 2;       /* pixels between shadows that do not touch */
 static const double EDGE = 1.5;          /* radii from the picture's edge */
 static const double SIZE_UNLIKE = .4;    /* |log| of radii, by which a shadow is of no ball of the phantom's sizes */
+static const double TWO_SIZES = 1.2;     /* times as wide are balls whose shadows tell them apart */
+static const double SIZE_OTHER = .15;    /* |log| of radii, at least, by which a shadow is of a ball of another size */
 static const double LIKENESS_LEAST = .9; /* of a shadow that is taken for a ball's though the drawing has none there */
 
 /* Where a view has the balls. */
@@ -88,6 +90,8 @@ static void places_of(const struct run *run, const struct pose *pose, struct pla
 
 int presence_unexplained(const struct run *run, int view, const struct pose *pose)
 {
+	/* Half of the way from one size of the phantom to the other. */
+	const double unlike = fmax(SIZE_OTHER, .5 * log(run->most / run->least));
 	const struct work *work = &run->works[view];
 	struct places places;
 	int unexplained;
@@ -99,8 +103,12 @@ int presence_unexplained(const struct run *run, int view, const struct pose *pos
 		bool found = !on_picture(run->request->nominal, place, radius) ||
 			     !stands_clear(&places, run->calibration->balls.count, b, place, radius);
 
-		for (int s = 0; s < work->count && !found; s++)
-			found = hypot(work->shadows[s].column - place[0], work->shadows[s].row - place[1]) <= radius;
+		for (int s = 0; s < work->count && !found; s++) {
+			const struct shadow *shadow = &work->shadows[s];
+
+			found = hypot(shadow->column - place[0], shadow->row - place[1]) <= radius &&
+				(run->most < TWO_SIZES * run->least || fabs(log(shadow->radius / radius)) <= unlike);
+		}
 		unexplained += !found;
 	}
 	return unexplained;

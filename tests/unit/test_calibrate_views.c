@@ -494,6 +494,98 @@ START_TEST(a_phantom_of_many_balls_is_found_turned_as_it_stood)
 }
 END_TEST
 
+/* The panel is moved up by 15 rows from the 12th view on: rows of a higher picture. */
+enum { MORE = 30, FIRST_RAISED = 11 };
+static int lower_row(int view)
+{
+	return view < FIRST_RAISED ? 8 : 23;
+}
+
+static int take_raised(void *context, int view, float *ret_image, struct error *err)
+{
+	struct arm_scene *scene = context;
+	const size_t columns = (size_t)scene->arm.columns, rows = (size_t)scene->arm.rows;
+	float *whole = malloc(columns * rows * sizeof(*whole));
+	int code;
+
+	ck_assert_ptr_nonnull(whole);
+	code = arm_image(scene, view, whole, err);
+	memcpy(ret_image, whole + columns * (size_t)lower_row(view), columns * (rows - MORE) * sizeof(*whole));
+	free(whole);
+	return code;
+}
+
+/*
+ * Circles 8 mm apart under a panel that jumps by 13 mm on it: of the views on one side of the jump each fits nearer to
+ * the last one of the other side a circle aside.
+ */
+START_TEST(like_circles_are_told_apart_where_the_panel_jumps)
+{
+	const struct ball_circles like = {.circles = 5, .balls = 6, .diameter = 60, .distance = 8, .ball = 2};
+	struct arm_scene scene = {
+	    .arm = {
+		.columns = 200, .rows = 80 + MORE, .count = 24, .pixel = .9, .step = 220 * M_PI / 180 / 23, .sag = 1}};
+	struct arm panel = scene.arm;
+	struct balls balls;
+	struct calibration calibration;
+	struct error err = {0};
+	int used = 0;
+
+	panel.rows = 80;
+	ck_assert(balls_circles(&balls, &like, &err) == 0);
+	scene.target = (struct target){.balls = &balls, .ball = .5, .photons = 20000};
+	ck_assert_msg(arm_calibrate(&panel, take_raised, &scene, &balls, false, &calibration, &err) == 0, "%s",
+		      err.text);
+	for (int k = 0; k < calibration.count; k++) {
+		struct view *view = &calibration.views[k].view;
+
+		/* The pose of the higher picture. */
+		for (int a = 0; a < 3; a++)
+			view->pixel0[a] -= lower_row(k) * view->row_step[a];
+		used += calibration.views[k].used;
+		if (calibration.views[k].used)
+			ck_assert_msg(arm_wrong(&scene.arm, k, view) <= 1, "view %d is wrong by %.1f pixels", k,
+				      arm_wrong(&scene.arm, k, view));
+	}
+	ck_assert_int_ge(used, 20);
+	ck_assert_double_eq(calibration.rival_height, 0);
+	calibration_clear(&calibration);
+	balls_clear(&balls);
+}
+END_TEST
+
+/*
+ * A few balls of another size tell how a phantom stood that is turned by more than half a step: by where the balls are
+ * it looks the same a step further.
+ */
+START_TEST(balls_of_another_size_tell_how_a_phantom_stood)
+{
+	enum { VIEWS = 20 };
+	struct ball_circles dense = {
+	    .circles = 2, .balls = 12, .diameter = 90, .distance = 45, .ball = 3, .shift = M_PI / 12};
+	struct arm_scene scene = {
+	    .arm = {.columns = 200, .rows = 116, .count = VIEWS, .pixel = 1.1, .step = 2 * M_PI / VIEWS, .sag = 1}};
+	const double turn = 18 * M_PI / 180;
+	struct balls balls, drawing;
+	struct calibration calibration;
+	struct error err = {0};
+
+	ck_assert(balls_circles(&drawing, &dense, &err) == 0);
+	dense.first = turn;
+	ck_assert(balls_circles(&balls, &dense, &err) == 0);
+	for (int b = 2; b < 24; b += 9)
+		drawing.ball[b].diameter = balls.ball[b].diameter = 4.5;
+	scene.target = (struct target){.balls = &balls, .ball = .5, .photons = 20000};
+	ck_assert_msg(arm_calibrate(&scene.arm, arm_image, &scene, &drawing, false, &calibration, &err) == 0, "%s",
+		      err.text);
+	ck_assert_double_eq_tol(calibration.turn, turn, .02);
+	ck_assert_double_eq(calibration.rival_turn, 0);
+	calibration_clear(&calibration);
+	balls_clear(&balls);
+	balls_clear(&drawing);
+}
+END_TEST
+
 Suite *calibrate_views_suite(void)
 {
 	Suite *suite = suite_create("calibrate_views");
@@ -511,6 +603,8 @@ Suite *calibrate_views_suite(void)
 	tcase_add_test(tests, a_pose_is_found_down_a_long_valley);
 	tcase_add_test(tests, a_phantom_of_many_balls_is_found_turned_as_it_stood);
 	tcase_add_loop_test(tests, of_like_circles_each_is_taken_for_itself, 0, sizeof(heights) / sizeof(*heights));
+	tcase_add_test(tests, like_circles_are_told_apart_where_the_panel_jumps);
+	tcase_add_test(tests, balls_of_another_size_tell_how_a_phantom_stood);
 	suite_add_tcase(suite, tests);
 	return suite;
 }
