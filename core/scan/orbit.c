@@ -315,25 +315,73 @@ static void follow(struct orbit *orbit, const struct placed *placed, const struc
 	}
 }
 
-/* Fan angles at the detector's outer edges, signed as alpha is, and the cylinder that the edges leave. */
-static void find_fan(struct orbit *orbit, const struct geometry *geometry)
+double orbit_field_of_view(const struct orbit *orbit, const struct geometry *geometry, const double centre[2])
 {
-	double sense = orbit->direction < 0 ? -1 : 1, low_side = INFINITY, high_side = INFINITY;
+	const double sense = orbit->direction < 0 ? -1 : 1;
+	double low_side = INFINITY, high_side = INFINITY;
 
 	for (int k = 0; k < geometry->count; k++) {
-		const struct view turned = orbit_view(orbit, &geometry->views[k]), *view = &turned;
-		double radius = hypot(view->source[0], view->source[1]);
-		double edge0 = sense * ray_angle(geometry, view, -0.5);
-		double edge1 = sense * ray_angle(geometry, view, geometry->columns - 0.5);
+		struct view view = orbit_view(orbit, &geometry->views[k]);
+		double radius, edge0, edge1;
 
-		orbit->half_fan_min += fmin(edge0, edge1) / geometry->count;
-		orbit->half_fan_max += fmax(edge0, edge1) / geometry->count;
+		for (int a = 0; a < 2; a++) {
+			view.source[a] -= centre[a];
+			view.pixel0[a] -= centre[a];
+		}
+		radius = hypot(view.source[0], view.source[1]);
+		edge0 = sense * ray_angle(geometry, &view, -0.5);
+		edge1 = sense * ray_angle(geometry, &view, geometry->columns - 0.5);
 		/* Beyond a right angle a ray leads away from the axis: the whole circle is seen. */
 		low_side = fmin(low_side, radius * sin(fmin(0.5 * M_PI, -fmin(edge0, edge1))));
 		high_side = fmin(high_side, radius * sin(fmin(0.5 * M_PI, fmax(edge0, edge1))));
 	}
+	return 2 * fmax(0, orbit->displaced ? fmax(low_side, high_side) : fmin(low_side, high_side));
+}
+
+void orbit_centre(const struct orbit *orbit, const struct geometry *geometry, double ret_centre[2])
+{
+	double mean[2] = {0}, square[3] = {0}, cube[2] = {0}, determinant;
+
+	for (int k = 0; k < geometry->count; k++) {
+		const struct view view = orbit_view(orbit, &geometry->views[k]);
+
+		for (int a = 0; a < 2; a++)
+			mean[a] += view.source[a] / geometry->count;
+	}
+	for (int k = 0; k < geometry->count; k++) {
+		const struct view view = orbit_view(orbit, &geometry->views[k]);
+		const double x = view.source[0] - mean[0], y = view.source[1] - mean[1];
+
+		square[0] += x * x;
+		square[1] += x * y;
+		square[2] += y * y;
+		cube[0] += 0.5 * x * (x * x + y * y);
+		cube[1] += 0.5 * y * (x * x + y * y);
+	}
+	determinant = square[0] * square[2] - square[1] * square[1];
+	ret_centre[0] = ret_centre[1] = 0;
+	/* Of an arc of about 60 degrees and less the middle is anywhere along its axis of symmetry. */
+	if (!(determinant > 0.01 * pow(square[0] + square[2], 2)))
+		return;
+	ret_centre[0] = mean[0] + (square[2] * cube[0] - square[1] * cube[1]) / determinant;
+	ret_centre[1] = mean[1] + (square[0] * cube[1] - square[1] * cube[0]) / determinant;
+}
+
+/* Fan angles at the detector's outer edges, signed as alpha is, and the cylinder that the edges leave. */
+static void find_fan(struct orbit *orbit, const struct geometry *geometry)
+{
+	const double sense = orbit->direction < 0 ? -1 : 1, origin[2] = {0};
+
+	for (int k = 0; k < geometry->count; k++) {
+		const struct view view = orbit_view(orbit, &geometry->views[k]);
+		const double edge0 = sense * ray_angle(geometry, &view, -0.5);
+		const double edge1 = sense * ray_angle(geometry, &view, geometry->columns - 0.5);
+
+		orbit->half_fan_min += fmin(edge0, edge1) / geometry->count;
+		orbit->half_fan_max += fmax(edge0, edge1) / geometry->count;
+	}
 	orbit->fan = orbit->half_fan_max - orbit->half_fan_min;
-	orbit->field_of_view = 2 * fmax(0, orbit->displaced ? fmax(low_side, high_side) : fmin(low_side, high_side));
+	orbit->field_of_view = orbit_field_of_view(orbit, geometry, origin);
 }
 
 /* As many columns as make the near side of a displaced detector as wide as the far one, in every view. */

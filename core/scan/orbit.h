@@ -130,15 +130,22 @@ double orbit_axis_weight(const struct orbit *orbit, int view);
  */
 struct view orbit_view(const struct orbit *orbit, const struct view *view);
 struct geometry orbit_sides(const struct orbit *orbit, const struct geometry *geometry);
+/*
+ * For core/orbit*.c only, too, and of that geometry: where in the orbit's frame, across its axis, the circle has its
+ * middle that is nearest to the sources by least squares (Kasa 1976), the origin for a short arc; and
+ * orbit.field_of_view about a place.
+ */
+void orbit_centre(const struct orbit *orbit, const struct geometry *geometry, double ret_centre[2]);
+double orbit_field_of_view(const struct orbit *orbit, const struct geometry *geometry, const double centre[2]);
 
 /*
- * A grid where none is given: cubic voxels at the resolution of the detector at the isocentre, coarsened so that no
- * side has more than `most` voxels, their slices where rows meet the axis and as high as those where they are higher;
- * across, the field of view, and along z all slices in which every view has the whole field of view on its rows, not
- * centred where the detector is not. One slice, where its plane meets the axis, for a detector of one row. An orbit
- * that leans so far that this leaves less than half of the height gets the largest box whose part of the field of view
- * all views see, narrower along the lean, and one whose views have next to no height in common the grid of
- * orbit_covering_grid: orbit_unseen_slices counts what some views do not see.
+ * A grid where none is given, about the axis where that is beside the origin: cubic voxels at the resolution of the
+ * detector at the isocentre, coarsened so that no side has more than `most` voxels, their slices where rows meet the
+ * axis and as high as those where they are higher; across, the field of view, and along z all slices in which every
+ * view has the whole field of view on its rows, not centred where the detector is not. One slice, where its plane meets
+ * the axis, for a detector of one row. An orbit that leans so far that this leaves less than half of the height gets
+ * the largest box whose part of the field of view all views see, narrower along the lean, and one whose views have next
+ * to no height in common the grid of orbit_covering_grid: orbit_unseen_slices counts what some views do not see.
  */
 void orbit_default_grid(const struct orbit *orbit, const struct geometry *geometry, int most, struct grid *ret_grid);
 /*

@@ -45,15 +45,18 @@ static double voxel_spacing(const struct orbit *orbit, const struct geometry *ge
 	return spacing;
 }
 
-/* Across the axis: the field of view, or where the views have no common cylinder, as much as the detector is wide. */
-static double grid_width(const struct orbit *orbit, const struct geometry *geometry)
+/*
+ * Across the axis, about a place: the field of view, or where the views have no common cylinder, as much as the
+ * detector is wide.
+ */
+static double grid_width(const struct orbit *orbit, const struct geometry *geometry, const double centre[2])
 {
-	double width = orbit->field_of_view, nearest = INFINITY;
+	double width = orbit_field_of_view(orbit, geometry, centre), nearest = INFINITY;
 
 	for (int k = 0; k < geometry->count; k++) {
 		const struct view view = orbit_view(orbit, &geometry->views[k]);
 
-		nearest = fmin(nearest, hypot(view.source[0], view.source[1]));
+		nearest = fmin(nearest, hypot(view.source[0] - centre[0], view.source[1] - centre[1]));
 	}
 	if (!(width > orbit->pixel_at_isocentre[0]))
 		width = orbit->pixel_at_isocentre[0] * geometry->columns;
@@ -64,7 +67,7 @@ static double grid_width(const struct orbit *orbit, const struct geometry *geome
 void orbit_covering_grid(const struct orbit *orbit, const struct geometry *given, int most, struct grid *ret_grid)
 {
 	const struct geometry sides_of = orbit_sides(orbit, given), *geometry = &sides_of;
-	const double width = grid_width(orbit, geometry);
+	const double origin[2] = {0}, width = grid_width(orbit, geometry, origin);
 	const double sides[3] = {width, width, geometry->rows > 1 ? 2 * half_height(orbit, geometry) : 0};
 	const double spacing = voxel_spacing(orbit, geometry, sides, most);
 
@@ -106,12 +109,12 @@ static void narrow_to_rows(const double matrix[12], const struct geometry *geome
 }
 
 /*
- * The range along the axis, mm, in which every view has the whole circle of this radius on its rows: a point at the
- * side of the source is magnified more and leaves them sooner than one on the axis. Empty (low > high) where there
- * is none.
+ * The range along the axis, mm, in which every view has the whole circle of this radius about a place on its rows: a
+ * point at the side of the source is magnified more and leaves them sooner than one on the axis. Empty (low > high)
+ * where there is none.
  */
-static void find_common_range(const struct orbit *orbit, const struct geometry *geometry, double radius,
-			      double ret_range[2])
+static void find_common_range(const struct orbit *orbit, const struct geometry *geometry, const double centre[2],
+			      double radius, double ret_range[2])
 {
 	enum { AROUND = 48 };
 
@@ -122,12 +125,12 @@ static void find_common_range(const struct orbit *orbit, const struct geometry *
 		double matrix[12];
 
 		view_matrix(&view, matrix);
-		narrow_to_rows(matrix, geometry, 0, 0, &ret_range[0], &ret_range[1]);
+		narrow_to_rows(matrix, geometry, centre[0], centre[1], &ret_range[0], &ret_range[1]);
 		for (int i = 0; i < AROUND; i++) {
 			const double angle = orbit->angle[k] + 2 * M_PI * i / AROUND;
 
-			narrow_to_rows(matrix, geometry, radius * cos(angle), radius * sin(angle), &ret_range[0],
-				       &ret_range[1]);
+			narrow_to_rows(matrix, geometry, centre[0] + radius * cos(angle),
+				       centre[1] + radius * sin(angle), &ret_range[0], &ret_range[1]);
 		}
 	}
 }
@@ -190,20 +193,21 @@ static void box_of_range(const struct orbit *orbit, double radius, const double 
 
 /* Where the detector's middle row is on the orbit's axis, mm along it, in the mean of all views; NAN where it is not.
  */
-static double middle_row_on_axis(const struct orbit *orbit, const struct geometry *geometry)
+static double middle_row_on_axis(const struct orbit *orbit, const struct geometry *geometry, const double centre[2])
 {
 	const double row = 0.5 * (geometry->rows - 1);
 	double sum = 0;
 
 	for (int k = 0; k < geometry->count; k++) {
 		const struct view view = orbit_view(orbit, &geometry->views[k]);
-		double matrix[12], slope;
+		double matrix[12], slope, depth;
 
 		view_matrix(&view, matrix);
 		slope = matrix[6] - row * matrix[10];
+		depth = matrix[8] * centre[0] + matrix[9] * centre[1] + matrix[11];
 		if (fabs(slope) < 1e-9 * fabs(matrix[6]) + 1e-300)
 			return NAN;
-		sum += (row * matrix[11] - matrix[7]) / slope;
+		sum += (row * depth - matrix[4] * centre[0] - matrix[5] * centre[1] - matrix[7]) / slope;
 	}
 	return sum / geometry->count;
 }
@@ -215,11 +219,11 @@ static double middle_row_on_axis(const struct orbit *orbit, const struct geometr
  * that iterations raise it without end: slices of 1190, 876, 1132 HU in a flat cylinder of 1020
  * (tests/bench/results/denoise.txt).
  */
-static void lay_slices_on_rows(const struct orbit *orbit, const struct geometry *geometry, double low, double high,
-			       int most, struct grid *grid)
+static void lay_slices_on_rows(const struct orbit *orbit, const struct geometry *geometry, const double centre[2],
+			       double low, double high, int most, struct grid *grid)
 {
 	const double spacing = grid->spacing[2];
-	const double row = middle_row_on_axis(orbit, geometry) * orbit->frame[2][2];
+	const double row = middle_row_on_axis(orbit, geometry, centre) * orbit->frame[2][2];
 	const double slice = row + (geometry->rows % 2 ? 0 : 0.5 * spacing);
 	/* Two rows have no slice on one of them in what all views see but for a part of a row (is_seen_by_all). */
 	static const double beyond[] = {1e-6, 0.25};
@@ -236,16 +240,30 @@ static void lay_slices_on_rows(const struct orbit *orbit, const struct geometry 
 	}
 }
 
+/* The origin; or the orbit's middle, where that has surely a wider field of view: a real arm's is some mm beside it. */
+static void find_centre(const struct orbit *orbit, const struct geometry *geometry, double ret_centre[2])
+{
+	const double wider = 1.05;
+
+	ret_centre[0] = ret_centre[1] = 0;
+	if (orbit->lean == 0)
+		orbit_centre(orbit, geometry, ret_centre);
+	if (!(orbit_field_of_view(orbit, geometry, ret_centre) > wider * orbit->field_of_view))
+		ret_centre[0] = ret_centre[1] = 0;
+}
+
 void orbit_default_grid(const struct orbit *orbit, const struct geometry *given, int most, struct grid *ret_grid)
 {
 	const struct geometry sides_of = orbit_sides(orbit, given), *geometry = &sides_of;
-	const double radius = 0.5 * grid_width(orbit, geometry), least = 0.25;
-	double range[2], low[3], high[3], sides[3], spacing;
+	const double least = 0.25;
+	double centre[2], radius, range[2], low[3], high[3], sides[3], spacing;
 	struct grid grid;
 	struct error err;
 
 	orbit_covering_grid(orbit, given, most, ret_grid);
-	find_common_range(orbit, geometry, radius, range);
+	find_centre(orbit, geometry, centre);
+	radius = 0.5 * grid_width(orbit, geometry, centre);
+	find_common_range(orbit, geometry, centre, radius, range);
 	/* One stray view may leave nothing in common; a part of what is covered is worth more than nothing. */
 	if (!(range[1] - range[0] >= least * 2 * half_height(orbit, geometry)) && geometry->rows > 1)
 		return;
@@ -254,6 +272,10 @@ void orbit_default_grid(const struct orbit *orbit, const struct geometry *given,
 	if (geometry->rows == 1)
 		range[0] = range[1] = 0.5 * (range[0] + range[1]);
 	box_of_range(orbit, radius, range, low, high);
+	for (int i = 0; i < 2; i++) {
+		low[i] += centre[i];
+		high[i] += centre[i];
+	}
 	for (int i = 0; i < 3; i++)
 		sides[i] = high[i] - low[i];
 	spacing = voxel_spacing(orbit, geometry, sides, most);
@@ -271,7 +293,7 @@ void orbit_default_grid(const struct orbit *orbit, const struct geometry *given,
 		grid.spacing[i] = mm;
 		grid.origin[i] = 0.5 * (low[i] + high[i]) - 0.5 * (grid.size[i] - 1) * mm;
 	}
-	lay_slices_on_rows(orbit, geometry, low[2], high[2], most, &grid);
+	lay_slices_on_rows(orbit, geometry, centre, low[2], high[2], most, &grid);
 	if (grid_check_geometry(&grid, given, &err) == 0)
 		*ret_grid = grid;
 }

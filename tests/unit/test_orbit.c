@@ -1011,6 +1011,52 @@ START_TEST(slices_of_a_default_grid_lie_on_rows)
 }
 END_TEST
 
+/*
+ * Calibrated on a phantom that was set down beside it, an arm turns about an axis beside the origin: the grid is about
+ * that axis, and has all of the field of view. It was the circle about the origin that all views see, so that bodies
+ * went on outside of it, and nothing was told. A real arm's axis is some mm off, and its grid stays about the origin.
+ */
+START_TEST(a_default_grid_is_about_an_axis_beside_the_origin)
+{
+	static const struct sweep sweeps[] = {{64, 36, 2, 0, 6, 60, {0, 0}, 0},
+					      {64, 36, 2, 30, -210.0 / 59, 60, {0, 0}, 0},
+					      {64, 36, 2, 0, 6, 60, {20, 0}, 0}};
+	static const double moves[][2] = {{20, -10}, {-45, 0}, {0.3, 0.2}};
+
+	for (size_t i = 0; i < 9; i++) {
+		const double *by = moves[i % 3];
+		struct geometry geometry = geometry_of(&sweeps[i / 3], NULL);
+		struct orbit orbit = orbit_of(&geometry);
+		struct grid still, grid;
+
+		orbit_default_grid(&orbit, &geometry, 512, &still);
+		orbit_clear(&orbit);
+		for (int k = 0; k < geometry.count; k++)
+			for (int a = 0; a < 2; a++) {
+				geometry.views[k].source[a] += by[a];
+				geometry.views[k].pixel0[a] += by[a];
+			}
+		orbit = orbit_of(&geometry);
+		orbit_default_grid(&orbit, &geometry, 512, &grid);
+		for (int a = 0; a < 3; a++) {
+			const double middle = grid.origin[a] + 0.5 * (grid.size[a] - 1) * grid.spacing[a];
+			const double was = still.origin[a] + 0.5 * (still.size[a] - 1) * still.spacing[a];
+			const double moved = a < 2 && fabs(by[0]) > 1 ? by[a] : 0;
+
+			/* Of a short scan the mean magnification is another one about the origin. */
+			ck_assert_msg(fabs(grid.size[a] * grid.spacing[a] / (still.size[a] * still.spacing[a]) - 1) <
+					  0.06,
+				      "%zu, axis %d: %d x %g mm of %d x %g", i, a, grid.size[a], grid.spacing[a],
+				      still.size[a], still.spacing[a]);
+			ck_assert_msg(fabs(middle - was - moved) < 0.05, "%zu, axis %d: %g mm, from %g", i, a, middle,
+				      was);
+		}
+		orbit_clear(&orbit);
+		geometry_clear(&geometry);
+	}
+}
+END_TEST
+
 /* Opposite views look along one direction, however many they are; so do those beside each other. */
 START_TEST(directions_are_counted_without_their_opposites)
 {
@@ -1160,6 +1206,7 @@ Suite *orbit_suite(void)
 	tcase_add_loop_test(grids, every_slice_of_a_default_grid_is_seen_by_all_views, 0, 6);
 	tcase_add_test(grids, a_default_grid_exists_for_any_orbit);
 	tcase_add_test(grids, slices_of_a_default_grid_lie_on_rows);
+	tcase_add_test(grids, a_default_grid_is_about_an_axis_beside_the_origin);
 	suite_add_tcase(suite, grids);
 	return suite;
 }
