@@ -13,6 +13,7 @@
  * Where a sweep jumps along the axis, or its end does not meet its beginning, a chain may go on a circle aside. The
  * views behind that stand where they surely explain more.
  */
+#include <limits.h>
 #include <math.h>
 #include <stdio.h>
 #include <stdlib.h>
@@ -123,7 +124,7 @@ static void chain_view(struct placing *placing, int at)
 	placing->chains[own].count++;
 }
 
-/* What a chain's views do not explain, moved further, over all of them. */
+/* What a chain's views do not explain where one of the motions moves them, each in `missed`; returns the sum. */
 static int unexplained(const struct placing *placing, int chain, int motion)
 {
 	const struct motions *motions = &placing->run->motions;
@@ -243,11 +244,13 @@ static int follow_evidence(const struct placing *placing, int chain, int own, in
 
 	for (int i = 0; i < placing->count; i++) {
 		const int *missed = placing->missed + (size_t)i * (size_t)motions->count;
-		int least = missed[0];
+		int least = INT_MAX;
 
-		for (int m = 1; m < motions->count && placing->stances[i].chain == chain; m++)
+		if (placing->stances[i].chain != chain)
+			continue;
+		for (int m = 0; m < motions->count; m++)
 			least = missed[m] < least ? missed[m] : least;
-		in_no_place += placing->stances[i].chain == chain ? least : 0;
+		in_no_place += least;
 	}
 	change = SURE * SURE + SURE * sqrt(in_no_place);
 	for (int m = 0; m < motions->count; m++)
@@ -385,7 +388,7 @@ int place_views(struct run *run, double *turn, struct error *err)
 	int code = 0;
 
 	if (stations == NULL || placing.stances == NULL || placing.chains == NULL || placing.missed == NULL ||
-	    poses == NULL || is_moved == NULL)
+	    placing.before == NULL || placing.motion == NULL || poses == NULL || is_moved == NULL)
 		code = error_set(err, ERR_NO_MEMORY, "no memory for %d views", count);
 	else
 		take_stances(&placing, stations);
