@@ -11,7 +11,8 @@
  *     told.
  *
  * Where a sweep jumps along the axis, or its end does not meet its beginning, a chain may go on a circle aside. The
- * views behind that stand where they surely explain more.
+ * views behind that surely explain more in another place, and so do views in which a bar hides a circle: both are
+ * refused.
  */
 #include <limits.h>
 #include <math.h>
@@ -366,7 +367,15 @@ static void decide(struct placing *placing, double *turn, struct pose *poses, bo
 				 placing->chains[longest].count, placing->count);
 			continue;
 		}
-		further = &motions->motion[placing->motion[i]];
+		if (placing->motion[i] != own) {
+			view->used = false;
+			snprintf(
+			    view->refused, sizeof(view->refused),
+			    "its shadows fit this phantom better from another place, where it looks the same, than "
+			    "from that of most views");
+			continue;
+		}
+		further = &motions->motion[own];
 		motion = sum_of(&stance->motion, further);
 		is_moved[stance->view] = motion.turn != 0 || motion.along != 0;
 		poses[stance->view] = moved(stance, further);

@@ -517,7 +517,7 @@ static int take_raised(void *context, int view, float *ret_image, struct error *
 
 /*
  * Circles 8 mm apart under a panel that jumps by 13 mm on it: of the views on one side of the jump each fits nearer to
- * the last one of the other side a circle aside.
+ * the last one of the other side a circle aside. They are not used so.
  */
 START_TEST(like_circles_are_told_apart_where_the_panel_jumps)
 {
@@ -529,27 +529,12 @@ START_TEST(like_circles_are_told_apart_where_the_panel_jumps)
 	struct balls balls;
 	struct calibration calibration;
 	struct error err = {0};
-	int used = 0;
 
 	panel.rows = 80;
 	ck_assert(balls_circles(&balls, &like, &err) == 0);
 	scene.target = (struct target){.balls = &balls, .ball = .5, .photons = 20000};
-	ck_assert_msg(arm_calibrate(&panel, take_raised, &scene, &balls, false, &calibration, &err) == 0, "%s",
-		      err.text);
-	for (int k = 0; k < calibration.count; k++) {
-		struct view *view = &calibration.views[k].view;
-
-		/* The pose of the higher picture. */
-		for (int a = 0; a < 3; a++)
-			view->pixel0[a] -= lower_row(k) * view->row_step[a];
-		used += calibration.views[k].used;
-		if (calibration.views[k].used)
-			ck_assert_msg(arm_wrong(&scene.arm, k, view) <= 1, "view %d is wrong by %.1f pixels", k,
-				      arm_wrong(&scene.arm, k, view));
-	}
-	ck_assert_int_ge(used, 20);
-	ck_assert_double_eq(calibration.rival_height, 0);
-	calibration_clear(&calibration);
+	ck_assert(arm_calibrate(&panel, take_raised, &scene, &balls, false, &calibration, &err) < 0);
+	ck_assert_ptr_nonnull(strstr(err.text, "views cannot be used"));
 	balls_clear(&balls);
 }
 END_TEST
