@@ -2,9 +2,9 @@
 # Every test: the house's rules, the unit tests and the black-box tests over HTTP, JOBS parts at a time: five for each
 # processor, since most of those over HTTP wait four fifths of their time. Unit suites compute: one for each processor,
 # and what waits for nothing goes behind what does (nice), so that they take the time that the others leave. What
-# cannot run here is skipped aloud. Closes with `N passed, N failed, N skipped`.
+# cannot run here is skipped aloud; what is long is left to --soak. Closes with `N passed, N failed, N skipped`.
 # Usage: tests/run.sh [--soak] [FILTER ...]   only the parts whose path has one of the words in it; --soak: the long
-# tests of tests/soak in place of all others
+# tests, those of tests/soak and those that a unit suite tags as long, in place of all others
 set -uo pipefail
 cd "$(dirname "$0")/.."
 export BUILD=${BUILD:-build}
@@ -21,10 +21,17 @@ results=$BUILD/test/results
 # none of them is left alone on one processor at the end.
 if [ "${1:-}" = --soak ]; then
 	shift
-	parts=(tests/soak/test_*.sh)
+	# Of the unit suites the tests that are tagged as long.
+	for part in $(grep -l 'tcase_set_tags(.*"long")' tests/unit/test_*.c); do
+		part=${part##*/test_}
+		parts+=("unit/${part%.c}")
+	done
+	parts+=(tests/soak/test_*.sh)
+	export CK_INCLUDE_TAGS=long
 	JOBS=${JOBS:-$((processors + 3))}
 else
 	JOBS=${JOBS:-$((5 * processors))}
+	export CK_EXCLUDE_TAGS=long
 	parts=(unit/recon unit/study unit/exterior unit/outofcore unit/metal unit/algorithm unit/stuck unit/detector unit/noise
 		unit/backend)
 	begin_with=(fleet restart devices_of_a_job page real postgresql phantom refine scatter fleet_network supervise

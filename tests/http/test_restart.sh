@@ -173,7 +173,7 @@ held_behind() { # ITERATION: waits until the newest checkpoint is of a later one
 }
 
 test_a_job_goes_on_from_its_newest_checkpoint_however_often_it_is_killed() {
-	local recipe at=0 i many=140
+	local recipe at=0 i many=100
 	for recipe in '"sart": {"iterations": '$many', "subsets": "views"}, "tv": {"method": "gradient", "iterations": 1}' '"cgls": {"iterations": '$many'}'; do
 		at=0
 		start_daemon --checkpoint-seconds 0.05
@@ -187,7 +187,7 @@ test_a_job_goes_on_from_its_newest_checkpoint_however_often_it_is_killed() {
 		get_volume final "$work/final.undisturbed" format=raw
 		post_job "$recipe"
 		# More often than a job without progress may lose its worker; every third time the daemon goes, too.
-		for ((i = 1; i <= 5; i++)); do
+		for ((i = 1; i <= 4; i++)); do
 			at=$(held_behind "$at")
 			if [ $((i % 3)) = 0 ]; then
 				stop_daemon KILL

@@ -1282,7 +1282,7 @@ Suite *detector_suite(void)
 {
 	Suite *suite = suite_create("detector");
 	TCase *lag = tcase_create("lag"), *scatter = tcase_create("scatter"), *fits = tcase_create("fits");
-	TCase *images = tcase_create("images"), *once = tcase_create("scattered once");
+	TCase *images = tcase_create("images"), *once = tcase_create("scattered once"), *longer = tcase_create("long");
 
 	tcase_set_timeout(lag, 120);
 	tcase_add_test(lag, lag_of_three_percent_leaves_no_ghost);
@@ -1296,7 +1296,11 @@ Suite *detector_suite(void)
 	tcase_add_test(lag, counts_are_corrected_again_in_a_run_that_goes_on);
 	suite_add_tcase(suite, lag);
 	tcase_set_timeout(scatter, 600);
-	tcase_add_loop_test(scatter, scatter_is_taken_off_objects_that_its_model_was_not_fitted_on, 0, 2);
+	tcase_set_timeout(longer, 600);
+	tcase_set_tags(longer, "long");
+	tcase_add_loop_test(longer, scatter_is_taken_off_objects_that_its_model_was_not_fitted_on, 0, 1);
+	suite_add_tcase(suite, longer);
+	tcase_add_loop_test(scatter, scatter_is_taken_off_objects_that_its_model_was_not_fitted_on, 1, 2);
 	tcase_add_test(scatter, a_body_holds_for_larger_ones_and_other_distances);
 	suite_add_tcase(suite, scatter);
 	tcase_set_timeout(once, 120);

@@ -133,26 +133,27 @@ static const struct {
 	const struct algorithm *other; /* in place of SART */
 	bool momentum;
 } cases[] = {
-    {"FDK", &full, true, false, 0, -1, 1e-6, false, NULL, false},
     {"FDK, cut off", &narrow, true, false, 0, -1, 1e-6, false, NULL, false},
     {"OS-SART, cut off", &narrow, true, true, 4, -1, 1e-4, false, NULL, false},
     {"FDK, displaced", &displaced, true, false, 0, -1, 1e-6, false, NULL, false},
     {"SIRT", &full, false, true, 1, -1, 1e-5, false, NULL, false},
-    {"OS-SART", &full, true, true, 4, -1, 1e-5, false, NULL, false},
     {"by view", &full, false, true, SUBSETS_VIEWS, -1, 1e-5, false, NULL, false},
+    {"matched, seen in part", &displaced, false, true, 3, -1, 1e-5, true, NULL, false},
+    {"TV of the noise", &full, true, true, 4, TV_OF_THE_NOISE, 1e-4, false, NULL, false},
+    {"CGLS and TV", &full, false, true, 4, TV_PROXIMAL, 1e-4, true, &algorithm_cgls, false},
+    {"FISTA and TV", &displaced, true, true, 4, TV_PROXIMAL, 1e-4, true, &algorithm_fista, false},
+    {"momentum and TV", &full, true, true, 4, TV_OF_THE_NOISE, 1e-4, false, NULL, true},
+    {"FDK", &full, true, false, 0, -1, 1e-6, false, NULL, false},
+    {"OS-SART", &full, true, true, 4, -1, 1e-5, false, NULL, false},
     {"matched", &full, true, true, 4, -1, 1e-5, true, NULL, false},
     {"matched, by view", &full, false, true, SUBSETS_VIEWS, -1, 1e-5, true, NULL, false},
-    {"matched, seen in part", &displaced, false, true, 3, -1, 1e-5, true, NULL, false},
     {"seen in part", &displaced, false, true, 3, -1, 1e-5, false, NULL, false},
     {"TV by steps", &full, true, true, 4, TV_GRADIENT, 1e-4, false, NULL, false},
     {"proximal TV", &full, true, true, 4, TV_PROXIMAL, 1e-4, false, NULL, false},
     {"TGV", &full, true, true, 4, TV_GENERALISED, 1e-4, false, NULL, false},
-    {"TV of the noise", &full, true, true, 4, TV_OF_THE_NOISE, 1e-4, false, NULL, false},
     {"CGLS", &full, true, true, 4, -1, 1e-4, true, &algorithm_cgls, false},
-    {"CGLS and TV", &full, false, true, 4, TV_PROXIMAL, 1e-4, true, &algorithm_cgls, false},
-    {"FISTA and TV", &displaced, true, true, 4, TV_PROXIMAL, 1e-4, true, &algorithm_fista, false},
-    {"momentum and TV", &full, true, true, 4, TV_OF_THE_NOISE, 1e-4, false, NULL, true},
 };
+enum { CASES = sizeof(cases) / sizeof(cases[0]), LONG_CASES = 9 /* the last ones */ };
 
 START_TEST(outofcore_give_what_the_whole_gives)
 {
@@ -404,10 +405,13 @@ END_TEST
 Suite *outofcore_suite(void)
 {
 	Suite *suite = suite_create("outofcore");
-	TCase *tests = tcase_create("outofcore");
+	TCase *tests = tcase_create("outofcore"), *longer = tcase_create("long");
 
 	tcase_set_timeout(tests, 0);
-	tcase_add_loop_test(tests, outofcore_give_what_the_whole_gives, 0, (int)(sizeof(cases) / sizeof(cases[0])));
+	tcase_set_timeout(longer, 0);
+	tcase_set_tags(longer, "long");
+	tcase_add_loop_test(tests, outofcore_give_what_the_whole_gives, 0, CASES - LONG_CASES);
+	tcase_add_loop_test(longer, outofcore_give_what_the_whole_gives, CASES - LONG_CASES, CASES);
 	tcase_add_test(tests, any_limit_gives_the_same_volume);
 	tcase_add_loop_test(tests, pixels_are_averaged_in_parts, 0, 2);
 	tcase_add_loop_test(tests, what_lies_outside_of_the_grid_is_left_out_in_parts, 0, 2);
@@ -416,5 +420,6 @@ Suite *outofcore_suite(void)
 	tcase_add_test(tests, what_metal_takes_of_the_host_is_said);
 	tcase_add_test(tests, defects_are_counted_once);
 	suite_add_tcase(suite, tests);
+	suite_add_tcase(suite, longer);
 	return suite;
 }

@@ -1010,7 +1010,7 @@ Suite *refine_suite(void);
 Suite *refine_suite(void)
 {
 	Suite *suite = suite_create("refine");
-	TCase *paths = tcase_create("paths"), *scans = tcase_create("scans");
+	TCase *paths = tcase_create("paths"), *scans = tcase_create("scans"), *longer = tcase_create("long");
 
 	tcase_add_test(paths, a_moved_object_is_seen_by_a_moved_view);
 	tcase_add_test(paths, more_knots_do_not_change_a_path);
@@ -1022,6 +1022,8 @@ Suite *refine_suite(void)
 	tcase_add_test(paths, a_displaced_detector_needs_a_reference);
 	suite_add_tcase(suite, paths);
 	tcase_set_timeout(scans, 300);
+	tcase_set_timeout(longer, 300);
+	tcase_set_tags(longer, "long");
 	tcase_add_test(scans, a_detector_that_sways_is_found);
 	tcase_add_test(scans, a_head_under_an_arm_that_sags_stays_where_it_is);
 	tcase_add_test(scans, a_head_that_nods_is_followed);
@@ -1031,10 +1033,13 @@ Suite *refine_suite(void)
 	tcase_add_loop_test(scans, a_displaced_detector_is_registered_with_a_reference, 0, 2);
 	tcase_add_test(scans, a_reference_of_something_else_is_not_followed);
 	tcase_add_loop_test(scans, a_reference_of_another_head_is_not_followed, 0, 2);
-	tcase_add_loop_test(scans, a_refinement_goes_on_from_where_it_left_off, 0, 3);
+	tcase_add_loop_test(longer, a_refinement_goes_on_from_where_it_left_off, 0, 1);
+	tcase_add_loop_test(scans, a_refinement_goes_on_from_where_it_left_off, 1, 3);
 	tcase_add_test(scans, any_number_of_threads_finds_the_same);
-	tcase_add_loop_test(scans, what_is_made_of_a_backend_finds_the_same, 0, 2);
+	tcase_add_loop_test(scans, what_is_made_of_a_backend_finds_the_same, 0, 1);
+	tcase_add_loop_test(longer, what_is_made_of_a_backend_finds_the_same, 1, 2);
 	tcase_add_test(scans, a_refinement_makes_room);
 	suite_add_tcase(suite, scans);
+	suite_add_tcase(suite, longer);
 	return suite;
 }

@@ -769,7 +769,7 @@ END_TEST
 Suite *stuck_suite(void)
 {
 	Suite *suite = suite_create("stuck");
-	TCase *tests = tcase_create("tests"), *wires = tcase_create("wires");
+	TCase *tests = tcase_create("tests"), *wires = tcase_create("wires"), *longer = tcase_create("long");
 
 	tcase_set_timeout(tests, 0);
 	tcase_add_loop_test(tests, an_object_is_no_stuck_pixel, 0, 4);
@@ -782,12 +782,17 @@ Suite *stuck_suite(void)
 	tcase_add_loop_test(tests, a_neighbour_of_mapped_pixels_is_judged_by_good_ones, 0, 4);
 	tcase_add_test(tests, a_thread_of_its_own_finds_the_same);
 	tcase_add_test(tests, a_look_that_is_given_up_leaves_nothing_behind);
-	tcase_add_loop_test(tests, errors_of_gain_are_found, 0, 2);
-	tcase_add_loop_test(tests, an_object_is_no_error_of_gain, 0, 2);
+	tcase_set_timeout(longer, 0);
+	tcase_set_tags(longer, "long");
+	tcase_add_loop_test(longer, errors_of_gain_are_found, 0, 1);
+	tcase_add_loop_test(tests, errors_of_gain_are_found, 1, 2);
+	tcase_add_loop_test(longer, an_object_is_no_error_of_gain, 0, 1);
+	tcase_add_loop_test(tests, an_object_is_no_error_of_gain, 1, 2);
 	tcase_add_test(tests, a_view_that_cannot_be_read_is_told);
 	suite_add_tcase(suite, tests);
 	tcase_set_timeout(wires, 0);
 	tcase_add_loop_test(wires, a_wire_stays_as_thin_as_it_is, 0, 2);
 	suite_add_tcase(suite, wires);
+	suite_add_tcase(suite, longer);
 	return suite;
 }

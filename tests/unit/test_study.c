@@ -344,7 +344,7 @@ END_TEST
 Suite *study_suite(void)
 {
 	Suite *suite = suite_create("study");
-	TCase *cases = tcase_create("64^3");
+	TCase *cases = tcase_create("64^3"), *longer = tcase_create("long");
 
 	for (int i = 0; i < 2; i++) {
 		void *memory = mmap(NULL, left_bytes, PROT_READ | PROT_WRITE, MAP_SHARED | MAP_ANONYMOUS, -1, 0);
@@ -352,12 +352,15 @@ Suite *study_suite(void)
 		left_by[i] = memory != MAP_FAILED ? memory : NULL;
 	}
 	tcase_set_timeout(cases, 0);
+	tcase_set_timeout(longer, 0);
+	tcase_set_tags(longer, "long");
 	tcase_add_test(cases, sart_takes_the_voxel_object_from_fdk_to_itself);
-	tcase_add_test(cases, conjugate_gradients_and_momentum_pass_a_hundred_iterations_of_sirt);
+	tcase_add_test(longer, conjugate_gradients_and_momentum_pass_a_hundred_iterations_of_sirt);
 	tcase_add_test(cases, tv_halves_the_error_that_noise_drives_up);
 	tcase_add_test(cases, fista_is_nearest_with_noise_on_exact_integrals);
 	tcase_add_test(cases, weights_of_the_noise_bring_fista_nearer);
 	tcase_add_test(cases, sart_and_tv_improve_on_fdk_with_exact_integrals);
 	suite_add_tcase(suite, cases);
+	suite_add_tcase(suite, longer);
 	return suite;
 }

@@ -1446,7 +1446,7 @@ test('no barriers, targets for fingers and nothing covered: every page, at every
 				await page.setViewportSize({ width, height })
 				await page.evaluate(() => new Promise(resolve => requestAnimationFrame(() => requestAnimationFrame(resolve))))
 				await page.emulateMedia({ colorScheme: 'light' })
-				if (width === 1366) { /* no rule of the style lies between this and 1440: the colours are the same */
+				if (width !== 1440 && width !== 390) { /* no rule of the style changes a colour in between */
 					await note(accessible(page, what, { rules: { 'color-contrast': { enabled: false } } }))
 				} else {
 					await note(accessible(page, `${what}, light`))
