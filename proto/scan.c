@@ -911,6 +911,27 @@ static void warn_uneven_distances(cJSON *list, const struct geometry *geometry)
 		    first, odd, geometry->count, first_odd, such);
 }
 
+/* The place of the axis about which the sources turn, at their height in the mean. */
+static void find_turning_point(const struct orbit *orbit, const struct geometry *geometry, double ret[3])
+{
+	double height = 0, from[3];
+
+	for (int k = 0; k < geometry->count; k++) {
+		orbit_from_centre(orbit, geometry->views[k].source, from);
+		height += from[2] / geometry->count;
+	}
+	for (int i = 0; i < 3; i++)
+		ret[i] = orbit->centre[i] + height * orbit->frame[2][i];
+}
+
+static bool falls_on_detector(const struct geometry *geometry, const double matrix[12], const double place[3])
+{
+	double column, row;
+
+	view_project(matrix, place, &column, &row);
+	return column > -1 && column < geometry->columns && row > -1 && row < geometry->rows;
+}
+
 /* Lengths in another unit, matrices that were made for another detector: possible, and hardly meant. */
 static void warn_implausible(cJSON *list, const struct scan *scan)
 {
@@ -921,15 +942,18 @@ static void warn_implausible(cJSON *list, const struct scan *scan)
 	const struct geometry *geometry = &scan->geometry;
 	double fan = orbit->fan / degree, pitch[2] = {0},
 	       magnification = orbit->source_to_detector / orbit->source_radius;
+	const double isocentre[3] = {0, 0, 0};
+	double turning_point[3];
 	int outside = 0;
 
+	find_turning_point(orbit, geometry, turning_point);
 	for (int k = 0; k < geometry->count; k++) {
-		const double isocentre[3] = {0, 0, 0};
-		double matrix[12], column, row;
+		double matrix[12];
 
 		view_matrix(&geometry->views[k], matrix);
-		view_project(matrix, isocentre, &column, &row);
-		outside += !(column > -1 && column < geometry->columns && row > -1 && row < geometry->rows);
+		/* The origin of matrices may be anywhere. */
+		outside += !falls_on_detector(geometry, matrix, isocentre) &&
+			   !falls_on_detector(geometry, matrix, turning_point);
 		pitch[0] += vec_norm(geometry->views[k].column_step) / geometry->count;
 		pitch[1] += vec_norm(geometry->views[k].row_step) / geometry->count;
 	}

@@ -108,7 +108,7 @@ static double reach_of(const struct grid *grid, const struct orbit *orbit)
 		for (int a = 0; a < 3; a++)
 			place[a] = grid->origin[a] + grid->spacing[a] * (grid->size[a] - 1) / 2;
 		place[axis] += (side % 2 ? 0.5 : -0.5) * grid->spacing[axis] * grid->size[axis];
-		farthest = fmax(farthest, hypot(vec_dot(orbit->frame[0], place), vec_dot(orbit->frame[1], place)));
+		farthest = fmax(farthest, orbit_from_axis(orbit, place));
 	}
 	return farthest;
 }

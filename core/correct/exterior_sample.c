@@ -62,15 +62,17 @@ static float held(const struct exterior_volume *s, const struct orbit *orbit, do
 {
 	const double radius = orbit->field_of_view / 2;
 	const double rim = radius - 1.5 * fmax(s->grid.spacing[0], s->grid.spacing[1]);
-	const double a = vec_dot(orbit->frame[0], place), b = vec_dot(orbit->frame[1], place);
-	const double from_axis = hypot(a, b), part = (from_axis - radius) / (EXTERIOR_MARGIN * radius);
+	const double from_axis = orbit_from_axis(orbit, place);
+	const double part = (from_axis - radius) / (EXTERIOR_MARGIN * radius);
+	double from[3];
 	struct corners corners;
 
 	*ret_beside = from_axis > radius;
 	if (from_axis <= radius || part >= 1)
 		return 0;
+	orbit_from_centre(orbit, place, from);
 	for (int i = 0; i < 3; i++)
-		place[i] += (rim / from_axis - 1) * (a * orbit->frame[0][i] + b * orbit->frame[1][i]);
+		place[i] += (rim / from_axis - 1) * (from[0] * orbit->frame[0][i] + from[1] * orbit->frame[1][i]);
 	corners = corners_of(&s->grid, place);
 	return value_at(s, &corners) * (float)(0.5 + 0.5 * cos(M_PI * part));
 }

@@ -58,14 +58,15 @@ static void box_add(struct box *box, const struct box *other)
 static void box_add_ray(struct box *box, const struct orbit *orbit, double radius, const double from[3],
 			const double way[3])
 {
-	double a = 0, b = 0, c = -radius * radius;
+	double a = 0, b = 0, c = -radius * radius, start[3];
 
+	orbit_from_centre(orbit, from, start);
 	for (int i = 0; i < 2; i++) {
-		const double start = vec_dot(orbit->frame[i], from), along = vec_dot(orbit->frame[i], way);
+		const double along = vec_dot(orbit->frame[i], way);
 
 		a += along * along;
-		b += start * along;
-		c += start * start;
+		b += start[i] * along;
+		c += start[i] * start[i];
 	}
 	for (int side = -1; side <= 1 && a > 0 && b * b > a * c; side += 2) {
 		const double part = (-b + side * sqrt(b * b - a * c)) / a;
@@ -388,11 +389,6 @@ static bool is_inside(const struct grid *grid, const double place[3])
 	return true;
 }
 
-static bool is_in_view(const struct orbit *orbit, const double place[3])
-{
-	return hypot(vec_dot(orbit->frame[0], place), vec_dot(orbit->frame[1], place)) <= orbit->field_of_view / 2;
-}
-
 /* Outwards from the middle: what not all views see becomes what is next to it, but for what is empty. */
 static void hold_ends(struct exterior_volume *s, const bool *empty)
 {
@@ -431,7 +427,7 @@ static void keep_what_is_known(struct exterior_volume *s, const struct exterior_
 				const bool inside = is_inside(options->grid, place.at);
 
 				if (!inside &&
-				    (empty[at] || !(options->truncated || is_in_view(options->orbit, place.at))))
+				    (empty[at] || !(options->truncated || orbit_is_in_view(options->orbit, place.at))))
 					s->voxels[at] = 0;
 				s->voxels[at] *= (float)options->factor;
 				kept += !inside && s->voxels[at] != 0;
@@ -515,7 +511,7 @@ static void leave_inside_away(const struct exterior_volume_options *options, con
 				const struct place place = place_of(grid, x, y, z);
 
 				ret_empty[grid_voxel(grid, x, y, z)] =
-				    is_inside(options->grid, place.at) || !is_in_view(options->orbit, place.at);
+				    is_inside(options->grid, place.at) || !orbit_is_in_view(options->orbit, place.at);
 			}
 }
 

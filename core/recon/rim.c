@@ -25,8 +25,9 @@ static size_t find_rim(const struct grid *grid, const struct orbit *orbit, int *
 
 	for (int y = 0; y < grid->size[1]; y++)
 		for (int x = 0; x < grid->size[0]; x++) {
-			const double r =
-			    hypot(grid->origin[0] + x * grid->spacing[0], grid->origin[1] + y * grid->spacing[1]);
+			const double place[3] = {grid->origin[0] + x * grid->spacing[0],
+						 grid->origin[1] + y * grid->spacing[1], orbit->centre[2]};
+			const double r = orbit_from_axis(orbit, place);
 			const double share = fmin(1, (r / radius - FROM) / OVER);
 
 			if (!(share > 0) || r > radius + edge)
@@ -45,7 +46,7 @@ static bool holds_rim(const struct grid *grid, const struct orbit *orbit)
 	const double reach = HELD * orbit->field_of_view / 2;
 
 	for (int a = 0; a < 2; a++) {
-		const double first = grid->origin[a] - 0.5 * grid->spacing[a];
+		const double first = grid->origin[a] - 0.5 * grid->spacing[a] - orbit->centre[a];
 
 		if (first > -reach || first + grid->size[a] * grid->spacing[a] < reach)
 			return false;

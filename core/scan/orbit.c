@@ -183,8 +183,7 @@ static int by_angle(const void *a, const void *b)
 	return x->view - y->view;
 }
 
-/* Angle of the ray through (column, middle row) against the line source - axis, counter-clockwise seen from +z. */
-static double ray_angle(const struct geometry *geometry, const struct view *view, double column)
+double orbit_ray_angle(const struct geometry *geometry, const struct view *view, double column)
 {
 	double row = 0.5 * (geometry->rows - 1);
 	double x = view->pixel0[0] + column * view->column_step[0] + row * view->row_step[0] - view->source[0];
@@ -315,73 +314,20 @@ static void follow(struct orbit *orbit, const struct placed *placed, const struc
 	}
 }
 
-double orbit_field_of_view(const struct orbit *orbit, const struct geometry *geometry, const double centre[2])
-{
-	const double sense = orbit->direction < 0 ? -1 : 1;
-	double low_side = INFINITY, high_side = INFINITY;
-
-	for (int k = 0; k < geometry->count; k++) {
-		struct view view = orbit_view(orbit, &geometry->views[k]);
-		double radius, edge0, edge1;
-
-		for (int a = 0; a < 2; a++) {
-			view.source[a] -= centre[a];
-			view.pixel0[a] -= centre[a];
-		}
-		radius = hypot(view.source[0], view.source[1]);
-		edge0 = sense * ray_angle(geometry, &view, -0.5);
-		edge1 = sense * ray_angle(geometry, &view, geometry->columns - 0.5);
-		/* Beyond a right angle a ray leads away from the axis: the whole circle is seen. */
-		low_side = fmin(low_side, radius * sin(fmin(0.5 * M_PI, -fmin(edge0, edge1))));
-		high_side = fmin(high_side, radius * sin(fmin(0.5 * M_PI, fmax(edge0, edge1))));
-	}
-	return 2 * fmax(0, orbit->displaced ? fmax(low_side, high_side) : fmin(low_side, high_side));
-}
-
-void orbit_centre(const struct orbit *orbit, const struct geometry *geometry, double ret_centre[2])
-{
-	double mean[2] = {0}, square[3] = {0}, cube[2] = {0}, determinant;
-
-	for (int k = 0; k < geometry->count; k++) {
-		const struct view view = orbit_view(orbit, &geometry->views[k]);
-
-		for (int a = 0; a < 2; a++)
-			mean[a] += view.source[a] / geometry->count;
-	}
-	for (int k = 0; k < geometry->count; k++) {
-		const struct view view = orbit_view(orbit, &geometry->views[k]);
-		const double x = view.source[0] - mean[0], y = view.source[1] - mean[1];
-
-		square[0] += x * x;
-		square[1] += x * y;
-		square[2] += y * y;
-		cube[0] += 0.5 * x * (x * x + y * y);
-		cube[1] += 0.5 * y * (x * x + y * y);
-	}
-	determinant = square[0] * square[2] - square[1] * square[1];
-	ret_centre[0] = ret_centre[1] = 0;
-	/* Of an arc of about 60 degrees and less the middle is anywhere along its axis of symmetry. */
-	if (!(determinant > 0.01 * pow(square[0] + square[2], 2)))
-		return;
-	ret_centre[0] = mean[0] + (square[2] * cube[0] - square[1] * cube[1]) / determinant;
-	ret_centre[1] = mean[1] + (square[0] * cube[1] - square[1] * cube[0]) / determinant;
-}
-
-/* Fan angles at the detector's outer edges, signed as alpha is, and the cylinder that the edges leave. */
+/* Fan angles at the detector's outer edges, signed as alpha is. */
 static void find_fan(struct orbit *orbit, const struct geometry *geometry)
 {
-	const double sense = orbit->direction < 0 ? -1 : 1, origin[2] = {0};
+	const double sense = orbit->direction < 0 ? -1 : 1;
 
 	for (int k = 0; k < geometry->count; k++) {
 		const struct view view = orbit_view(orbit, &geometry->views[k]);
-		const double edge0 = sense * ray_angle(geometry, &view, -0.5);
-		const double edge1 = sense * ray_angle(geometry, &view, geometry->columns - 0.5);
+		const double edge0 = sense * orbit_ray_angle(geometry, &view, -0.5);
+		const double edge1 = sense * orbit_ray_angle(geometry, &view, geometry->columns - 0.5);
 
 		orbit->half_fan_min += fmin(edge0, edge1) / geometry->count;
 		orbit->half_fan_max += fmax(edge0, edge1) / geometry->count;
 	}
 	orbit->fan = orbit->half_fan_max - orbit->half_fan_min;
-	orbit->field_of_view = orbit_field_of_view(orbit, geometry, origin);
 }
 
 /* As many columns as make the near side of a displaced detector as wide as the far one, in every view. */
@@ -437,6 +383,7 @@ int orbit_analyse(struct orbit *ret_orbit, const struct geometry *given, struct 
 	follow(&orbit, placed, station, find_stations(placed, geometry->count, station), aside);
 	orbit.displaced = aside && !orbit.short_scan;
 	find_fan(&orbit, geometry);
+	orbit_find_centre(&orbit, geometry);
 	if (orbit.displaced)
 		orbit.pad[orbit.displacement > 0 ? 0 : 1] = find_padding(&orbit, geometry);
 	orbit.parker_delta = 0.5 * (orbit.arc - M_PI);
@@ -491,8 +438,8 @@ static double overlap(const struct orbit *orbit, const struct geometry *geometry
 
 	for (int k = 0; k < geometry->count; k++) {
 		const struct view view = orbit_view(orbit, &geometry->views[k]);
-		double edge0 = sense * ray_angle(geometry, &view, -0.5);
-		double edge1 = sense * ray_angle(geometry, &view, geometry->columns - 0.5);
+		double edge0 = sense * orbit_ray_angle(geometry, &view, -0.5);
+		double edge1 = sense * orbit_ray_angle(geometry, &view, geometry->columns - 0.5);
 
 		theta = fmin(theta, wide_high ? -fmin(edge0, edge1) : fmax(edge0, edge1));
 	}
@@ -577,7 +524,7 @@ void orbit_column_weights(const struct orbit *orbit, const struct geometry *geom
 		double b = place_in_arc(orbit, k), constant = 0.5 * orbit->weight[k] * view_weight(view);
 
 		for (int column = 0; column < geometry->columns; column++) {
-			double alpha = sense * ray_angle(geometry, view, column), weight = 1;
+			double alpha = sense * orbit_ray_angle(geometry, view, column), weight = 1;
 
 			if (orbit->short_scan)
 				weight = parker(b, alpha, orbit->parker_delta);

@@ -50,8 +50,15 @@ struct orbit {
 	double fan, half_fan_min, half_fan_max;
 	double source_radius;      /* mm, mean distance of the sources from the axis */
 	double source_to_detector; /* mm, mean, along the normal */
-	double field_of_view;      /* mm, diameter of the cylinder that all views see, or one half when displaced */
-	double displacement;       /* mm at the detector, along +u, of its centre from the ray through the axis, mean */
+	/*
+	 * mm, in the world: about it, along the frame's z, are the field of view, what is sought outside of a grid, and
+	 * the grids below. It is the origin; but where the sources' circle has its middle beside that and has surely
+	 * the wider field of view there (a real arm's is some mm beside it), that middle; and where the rows do not
+	 * reach the origin's height, their middle's. Angles and FDK's weights are about the origin in any case.
+	 */
+	double centre[3];
+	double field_of_view; /* mm, diameter of the cylinder that all views see, or one half when displaced */
+	double displacement;  /* mm at the detector, along +u, of its centre from the ray through the axis, mean */
 	bool displaced; /* half-fan weights: full turn, displaced by more than 2 % of the width and half a pixel */
 	/*
 	 * Columns that FDK adds before column 0 and behind the last one, zero before
@@ -131,25 +138,34 @@ double orbit_axis_weight(const struct orbit *orbit, int view);
 struct view orbit_view(const struct orbit *orbit, const struct view *view);
 struct geometry orbit_sides(const struct orbit *orbit, const struct geometry *geometry);
 /*
- * For core/orbit*.c only, too, and of that geometry: where in the orbit's frame, across its axis, the circle has its
- * middle that is nearest to the sources by least squares (Kasa 1976), the origin for a short arc; and
- * orbit.field_of_view about a place.
+ * For core/orbit*.c only, too, and of that geometry: a view about the orbit's centre; the angle of the ray through
+ * (column, middle row) of such a view against the line from source to axis, counter-clockwise seen from +z; where the
+ * detector's middle row meets the axis, mm along it from the centre, in the mean of all views, NAN where it does not.
  */
-void orbit_centre(const struct orbit *orbit, const struct geometry *geometry, double ret_centre[2]);
-double orbit_field_of_view(const struct orbit *orbit, const struct geometry *geometry, const double centre[2]);
+struct view orbit_centred_view(const struct orbit *orbit, const struct view *view);
+double orbit_ray_angle(const struct geometry *geometry, const struct view *view, double column);
+double orbit_middle_row(const struct orbit *orbit, const struct geometry *geometry);
+/* Sets centre and field_of_view; the rest is known. */
+void orbit_find_centre(struct orbit *orbit, const struct geometry *geometry);
+
+/* A place in the world from the centre, in the frame; and how far it is from the axis through the centre, mm. */
+void orbit_from_centre(const struct orbit *orbit, const double place[3], double ret[3]);
+double orbit_from_axis(const struct orbit *orbit, const double place[3]);
+/* True in the field of view, whatever the height. */
+bool orbit_is_in_view(const struct orbit *orbit, const double place[3]);
 
 /*
- * A grid where none is given, about the axis where that is beside the origin: cubic voxels at the resolution of the
- * detector at the isocentre, coarsened so that no side has more than `most` voxels, their slices where rows meet the
- * axis and as high as those where they are higher; across, the field of view, and along z all slices in which every
- * view has the whole field of view on its rows, not centred where the detector is not. One slice, where its plane meets
- * the axis, for a detector of one row. An orbit that leans so far that this leaves less than half of the height gets
- * the largest box whose part of the field of view all views see, narrower along the lean, and one whose views have next
- * to no height in common the grid of orbit_covering_grid: orbit_unseen_slices counts what some views do not see.
+ * A grid where none is given: cubic voxels at the resolution of the detector at the isocentre, coarsened so that no
+ * side has more than `most` voxels, their slices where rows meet the axis and as high as those where they are higher;
+ * across, the field of view, and along z all slices in which every view has the whole field of view on its rows, not
+ * centred where the detector is not. One slice, where its plane meets the axis, for a detector of one row. An orbit
+ * that leans so far that this leaves less than half of the height gets the largest box whose part of the field of view
+ * all views see, narrower along the lean, and one whose views have next to no height in common the grid of
+ * orbit_covering_grid: orbit_unseen_slices counts what some views do not see.
  */
 void orbit_default_grid(const struct orbit *orbit, const struct geometry *geometry, int most, struct grid *ret_grid);
 /*
- * The same centred on the isocentre and with all that the cone covers on the axis along z: the slices at its ends
+ * The same about the orbit's centre and with all that the cone covers on the axis along z: the slices at its ends
  * are not seen by all views.
  */
 void orbit_covering_grid(const struct orbit *orbit, const struct geometry *geometry, int most, struct grid *ret_grid);

@@ -10,13 +10,13 @@
 
 #include "core/scan/orbit.h"
 
-/* Half of the height on the axis that the detector's middle column covers, mm, to the farther side of the isocentre. */
+/* Half of the height on the axis that the detector's middle column covers, mm, to the farther side of the centre. */
 static double half_height(const struct orbit *orbit, const struct geometry *geometry)
 {
 	double farthest = 0;
 
 	for (int k = 0; k < geometry->count; k++) {
-		const struct view turned = orbit_view(orbit, &geometry->views[k]), *view = &turned;
+		const struct view turned = orbit_centred_view(orbit, &geometry->views[k]), *view = &turned;
 		double radius = hypot(view->source[0], view->source[1]);
 
 		for (int end = 0; end < 2; end++) {
@@ -45,18 +45,15 @@ static double voxel_spacing(const struct orbit *orbit, const struct geometry *ge
 	return spacing;
 }
 
-/*
- * Across the axis, about a place: the field of view, or where the views have no common cylinder, as much as the
- * detector is wide.
- */
-static double grid_width(const struct orbit *orbit, const struct geometry *geometry, const double centre[2])
+/* Across the axis: the field of view, or where the views have no common cylinder, as much as the detector is wide. */
+static double grid_width(const struct orbit *orbit, const struct geometry *geometry)
 {
-	double width = orbit_field_of_view(orbit, geometry, centre), nearest = INFINITY;
+	double width = orbit->field_of_view, nearest = INFINITY;
 
 	for (int k = 0; k < geometry->count; k++) {
-		const struct view view = orbit_view(orbit, &geometry->views[k]);
+		const struct view view = orbit_centred_view(orbit, &geometry->views[k]);
 
-		nearest = fmin(nearest, hypot(view.source[0] - centre[0], view.source[1] - centre[1]));
+		nearest = fmin(nearest, hypot(view.source[0], view.source[1]));
 	}
 	if (!(width > orbit->pixel_at_isocentre[0]))
 		width = orbit->pixel_at_isocentre[0] * geometry->columns;
@@ -67,7 +64,7 @@ static double grid_width(const struct orbit *orbit, const struct geometry *geome
 void orbit_covering_grid(const struct orbit *orbit, const struct geometry *given, int most, struct grid *ret_grid)
 {
 	const struct geometry sides_of = orbit_sides(orbit, given), *geometry = &sides_of;
-	const double origin[2] = {0}, width = grid_width(orbit, geometry, origin);
+	const double width = grid_width(orbit, geometry);
 	const double sides[3] = {width, width, geometry->rows > 1 ? 2 * half_height(orbit, geometry) : 0};
 	const double spacing = voxel_spacing(orbit, geometry, sides, most);
 
@@ -77,11 +74,14 @@ void orbit_covering_grid(const struct orbit *orbit, const struct geometry *given
 		ret_grid->spacing[i] = spacing;
 	}
 	grid_centre(ret_grid);
+	for (int i = 0; i < 3; i++)
+		ret_grid->origin[i] += orbit->centre[i];
 }
 
 /* ---- what all views see ---- */
 
-/* Narrows ret_low .. ret_high, along z of the orbit's frame, to where (x, y, z) lies on the rows of the view. */
+/* Narrows ret_low .. ret_high, along the axis from the orbit's centre, to where (x, y, z) lies on the rows of the view.
+ */
 static void narrow_to_rows(const double matrix[12], const struct geometry *geometry, double x, double y,
 			   double *ret_low, double *ret_high)
 {
@@ -109,28 +109,28 @@ static void narrow_to_rows(const double matrix[12], const struct geometry *geome
 }
 
 /*
- * The range along the axis, mm, in which every view has the whole circle of this radius about a place on its rows: a
+ * The range along the axis from the centre, mm, in which every view has the whole circle of this radius on its rows: a
  * point at the side of the source is magnified more and leaves them sooner than one on the axis. Empty (low > high)
  * where there is none.
  */
-static void find_common_range(const struct orbit *orbit, const struct geometry *geometry, const double centre[2],
-			      double radius, double ret_range[2])
+static void find_common_range(const struct orbit *orbit, const struct geometry *geometry, double radius,
+			      double ret_range[2])
 {
 	enum { AROUND = 48 };
 
 	ret_range[0] = -INFINITY;
 	ret_range[1] = INFINITY;
 	for (int k = 0; k < geometry->count; k++) {
-		const struct view view = orbit_view(orbit, &geometry->views[k]);
+		const struct view view = orbit_centred_view(orbit, &geometry->views[k]);
 		double matrix[12];
 
 		view_matrix(&view, matrix);
-		narrow_to_rows(matrix, geometry, centre[0], centre[1], &ret_range[0], &ret_range[1]);
+		narrow_to_rows(matrix, geometry, 0, 0, &ret_range[0], &ret_range[1]);
 		for (int i = 0; i < AROUND; i++) {
 			const double angle = orbit->angle[k] + 2 * M_PI * i / AROUND;
 
-			narrow_to_rows(matrix, geometry, centre[0] + radius * cos(angle),
-				       centre[1] + radius * sin(angle), &ret_range[0], &ret_range[1]);
+			narrow_to_rows(matrix, geometry, radius * cos(angle), radius * sin(angle), &ret_range[0],
+				       &ret_range[1]);
 		}
 	}
 }
@@ -191,27 +191,6 @@ static void box_of_range(const struct orbit *orbit, double radius, const double 
 	}
 }
 
-/* Where the detector's middle row is on the orbit's axis, mm along it, in the mean of all views; NAN where it is not.
- */
-static double middle_row_on_axis(const struct orbit *orbit, const struct geometry *geometry, const double centre[2])
-{
-	const double row = 0.5 * (geometry->rows - 1);
-	double sum = 0;
-
-	for (int k = 0; k < geometry->count; k++) {
-		const struct view view = orbit_view(orbit, &geometry->views[k]);
-		double matrix[12], slope, depth;
-
-		view_matrix(&view, matrix);
-		slope = matrix[6] - row * matrix[10];
-		depth = matrix[8] * centre[0] + matrix[9] * centre[1] + matrix[11];
-		if (fabs(slope) < 1e-9 * fabs(matrix[6]) + 1e-300)
-			return NAN;
-		sum += (row * depth - matrix[4] * centre[0] - matrix[5] * centre[1] - matrix[7]) / slope;
-	}
-	return sum / geometry->count;
-}
-
 /*
  * Slices across z of [low, high], their outermost centres inside of it, which lie where rows meet the axis. With voxels
  * of a pixel and slices between two rows, the rays near the middle plane are the means of both slices beside them. What
@@ -219,11 +198,11 @@ static double middle_row_on_axis(const struct orbit *orbit, const struct geometr
  * that iterations raise it without end: slices of 1190, 876, 1132 HU in a flat cylinder of 1020
  * (tests/bench/results/denoise.txt).
  */
-static void lay_slices_on_rows(const struct orbit *orbit, const struct geometry *geometry, const double centre[2],
-			       double low, double high, int most, struct grid *grid)
+static void lay_slices_on_rows(const struct orbit *orbit, const struct geometry *geometry, double low, double high,
+			       int most, struct grid *grid)
 {
 	const double spacing = grid->spacing[2];
-	const double row = middle_row_on_axis(orbit, geometry, centre) * orbit->frame[2][2];
+	const double row = orbit->centre[2] + orbit_middle_row(orbit, geometry) * orbit->frame[2][2];
 	const double slice = row + (geometry->rows % 2 ? 0 : 0.5 * spacing);
 	/* Two rows have no slice on one of them in what all views see but for a part of a row (is_seen_by_all). */
 	static const double beyond[] = {1e-6, 0.25};
@@ -240,30 +219,17 @@ static void lay_slices_on_rows(const struct orbit *orbit, const struct geometry 
 	}
 }
 
-/* The origin; or the orbit's middle, where that has surely a wider field of view: a real arm's is some mm beside it. */
-static void find_centre(const struct orbit *orbit, const struct geometry *geometry, double ret_centre[2])
-{
-	const double wider = 1.05;
-
-	ret_centre[0] = ret_centre[1] = 0;
-	if (orbit->lean == 0)
-		orbit_centre(orbit, geometry, ret_centre);
-	if (!(orbit_field_of_view(orbit, geometry, ret_centre) > wider * orbit->field_of_view))
-		ret_centre[0] = ret_centre[1] = 0;
-}
-
 void orbit_default_grid(const struct orbit *orbit, const struct geometry *given, int most, struct grid *ret_grid)
 {
 	const struct geometry sides_of = orbit_sides(orbit, given), *geometry = &sides_of;
 	const double least = 0.25;
-	double centre[2], radius, range[2], low[3], high[3], sides[3], spacing;
+	double radius, range[2], low[3], high[3], sides[3], spacing;
 	struct grid grid;
 	struct error err;
 
 	orbit_covering_grid(orbit, given, most, ret_grid);
-	find_centre(orbit, geometry, centre);
-	radius = 0.5 * grid_width(orbit, geometry, centre);
-	find_common_range(orbit, geometry, centre, radius, range);
+	radius = 0.5 * grid_width(orbit, geometry);
+	find_common_range(orbit, geometry, radius, range);
 	/* One stray view may leave nothing in common; a part of what is covered is worth more than nothing. */
 	if (!(range[1] - range[0] >= least * 2 * half_height(orbit, geometry)) && geometry->rows > 1)
 		return;
@@ -272,12 +238,11 @@ void orbit_default_grid(const struct orbit *orbit, const struct geometry *given,
 	if (geometry->rows == 1)
 		range[0] = range[1] = 0.5 * (range[0] + range[1]);
 	box_of_range(orbit, radius, range, low, high);
-	for (int i = 0; i < 2; i++) {
-		low[i] += centre[i];
-		high[i] += centre[i];
-	}
-	for (int i = 0; i < 3; i++)
+	for (int i = 0; i < 3; i++) {
+		low[i] += orbit->centre[i];
+		high[i] += orbit->centre[i];
 		sides[i] = high[i] - low[i];
+	}
 	spacing = voxel_spacing(orbit, geometry, sides, most);
 	for (int i = 0; i < 3; i++) {
 		/*
@@ -293,7 +258,7 @@ void orbit_default_grid(const struct orbit *orbit, const struct geometry *given,
 		grid.spacing[i] = mm;
 		grid.origin[i] = 0.5 * (low[i] + high[i]) - 0.5 * (grid.size[i] - 1) * mm;
 	}
-	lay_slices_on_rows(orbit, geometry, centre, low[2], high[2], most, &grid);
+	lay_slices_on_rows(orbit, geometry, low[2], high[2], most, &grid);
 	if (grid_check_geometry(&grid, given, &err) == 0)
 		*ret_grid = grid;
 }
@@ -302,9 +267,9 @@ void orbit_default_grid(const struct orbit *orbit, const struct geometry *given,
 static bool is_seen_by_all(const struct orbit *orbit, const struct geometry *geometry, double (*matrices)[12],
 			   const double world[3])
 {
-	const double place[3] = {vec_dot(orbit->frame[0], world), vec_dot(orbit->frame[1], world),
-				 vec_dot(orbit->frame[2], world)};
+	double place[3];
 
+	orbit_from_centre(orbit, world, place);
 	if (hypot(place[0], place[1]) > 0.5 * orbit->field_of_view * (1 + 1e-6))
 		return true;
 	for (int k = 0; k < geometry->count; k++) {
@@ -345,7 +310,7 @@ int orbit_unseen_slices(const struct orbit *orbit, const struct geometry *given,
 	if (matrices == NULL)
 		return error_set(err, ERR_NO_MEMORY, "no memory for %d matrices", geometry->count);
 	for (int k = 0; k < geometry->count; k++) {
-		const struct view view = orbit_view(orbit, &geometry->views[k]);
+		const struct view view = orbit_centred_view(orbit, &geometry->views[k]);
 
 		view_matrix(&view, matrices[k]);
 	}

@@ -839,9 +839,11 @@ START_TEST(a_default_grid_covers_what_is_seen_and_no_more)
 	    /* 60 mm up: from 20 * (620 + 123.5) / 1100 = 13.5 mm at the far side to 100 * (620 - 123.5) / 1100 = 45.1.
 	     */
 	    {{559, 101, 0.8, 0, 3.6, 100, {0, 60}, 0}, 1024, {548, 548, 71}, 0.8 * 620 / 1100, 29.33},
-	    /* Nearly two fields of view up no slice is seen by all views as a whole: as much as is covered on the axis.
+	    /*
+	     * Nearly two fields of view up no slice is seen by all views as a whole: as much as is covered on the axis,
+	     * at 200 * 620 / 1100 = 112.7 mm. It was 601 slices about the origin.
 	     */
-	    {{559, 101, 0.8, 0, 3.6, 100, {0, 200}, 0}, 1024, {548, 548, 601}, 0.8 * 620 / 1100, 0},
+	    {{559, 101, 0.8, 0, 3.6, 100, {0, 200}, 0}, 1024, {548, 548, 101}, 0.8 * 620 / 1100, 112.73},
 	};
 
 	for (size_t i = 0; i < sizeof(rows) / sizeof(*rows); i++) {
@@ -1014,25 +1016,27 @@ END_TEST
 /*
  * Calibrated on a phantom that was set down beside it, an arm turns about an axis beside the origin: the grid is about
  * that axis, and has all of the field of view. It was the circle about the origin that all views see, so that bodies
- * went on outside of it, and nothing was told. A real arm's axis is some mm off, and its grid stays about the origin.
+ * went on outside of it, and nothing was told. Where the origin is above or below the rows as well, the grid was as
+ * high as the way from there to them, twice. A real arm's axis is some mm off, and its grid stays about the origin.
  */
 START_TEST(a_default_grid_is_about_an_axis_beside_the_origin)
 {
 	static const struct sweep sweeps[] = {{64, 36, 2, 0, 6, 60, {0, 0}, 0},
 					      {64, 36, 2, 30, -210.0 / 59, 60, {0, 0}, 0},
 					      {64, 36, 2, 0, 6, 60, {20, 0}, 0}};
-	static const double moves[][2] = {{20, -10}, {-45, 0}, {0.3, 0.2}};
+	static const double moves[][3] = {{20, -10, 0}, {-45, 0, 150}, {0.3, 0.2, 0}, {0, 0, -60}, {0.3, 0.2, 5}};
+	enum { MOVES = sizeof(moves) / sizeof(*moves) };
 
-	for (size_t i = 0; i < 9; i++) {
-		const double *by = moves[i % 3];
-		struct geometry geometry = geometry_of(&sweeps[i / 3], NULL);
+	for (size_t i = 0; i < 3 * MOVES; i++) {
+		const double *by = moves[i % MOVES];
+		struct geometry geometry = geometry_of(&sweeps[i / MOVES], NULL);
 		struct orbit orbit = orbit_of(&geometry);
 		struct grid still, grid;
 
 		orbit_default_grid(&orbit, &geometry, 512, &still);
 		orbit_clear(&orbit);
 		for (int k = 0; k < geometry.count; k++)
-			for (int a = 0; a < 2; a++) {
+			for (int a = 0; a < 3; a++) {
 				geometry.views[k].source[a] += by[a];
 				geometry.views[k].pixel0[a] += by[a];
 			}
@@ -1041,7 +1045,7 @@ START_TEST(a_default_grid_is_about_an_axis_beside_the_origin)
 		for (int a = 0; a < 3; a++) {
 			const double middle = grid.origin[a] + 0.5 * (grid.size[a] - 1) * grid.spacing[a];
 			const double was = still.origin[a] + 0.5 * (still.size[a] - 1) * still.spacing[a];
-			const double moved = a < 2 && fabs(by[0]) > 1 ? by[a] : 0;
+			const double moved = a == 2 || fabs(by[0]) > 1 ? by[a] : 0;
 
 			/* Of a short scan the mean magnification is another one about the origin. */
 			ck_assert_msg(fabs(grid.size[a] * grid.spacing[a] / (still.size[a] * still.spacing[a]) - 1) <

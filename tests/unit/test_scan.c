@@ -510,6 +510,24 @@ static void other_detector(struct view *view, int k)
 	for (int i = 0; i < 3; i++)
 		view->pixel0[i] += 24 * view->column_step[i];
 }
+/* Matrices of a detector whose first 40 rows were cut off afterwards. */
+static void other_rows(struct view *view, int k)
+{
+	(void)k;
+	for (int i = 0; i < 3; i++)
+		view->pixel0[i] += 40 * view->row_step[i];
+}
+/* As by a calibration whose origin lies far from what is seen. */
+static void moved_aside_and_up(struct view *view, int k)
+{
+	static const double by[] = {12, -9, 300};
+
+	(void)k;
+	for (int i = 0; i < 3; i++) {
+		view->source[i] += by[i];
+		view->pixel0[i] += by[i];
+	}
+}
 static void columns_back(struct view *view, int k)
 {
 	(void)k;
@@ -543,6 +561,8 @@ static const struct {
     {coarser, "other_pitch"},
     {rows_coarser, "other_pitch"},
     {other_detector, "isocentre_outside"},
+    {other_rows, "isocentre_outside"},
+    {moved_aside_and_up, NULL},
     {columns_back, "mirrored_columns"},
     {one_back, "mirrored_views"},
     {rows_down, NULL}, /* as most images are stored */
