@@ -1,4 +1,4 @@
-/* cbct fit-hardening: water's polynomial of beam hardening from a step wedge. */
+/* cbct fit-hardening: water's polynomial of beam hardening from a step wedge, or from rays through a bottle. */
 #include <math.h>
 #include <stdlib.h>
 
@@ -81,13 +81,16 @@ static int fit_hardening_run(const void *values, struct error *err)
 }
 
 static const struct fit_hardening_options defaults = {.output = "-", .degree = 3, .attenuation = OPTION_UNSET_NUMBER};
-static const struct positional positionals[] = {
-    {"POINTS", "a text file with a line for each step: millimetres of water, and the line integral measured behind it",
-     offsetof(struct fit_hardening_options, points), true},
-    {0}};
+static const struct positional positionals[] = {{"POINTS",
+						 "a text file with a line for each step of a wedge, or each ray "
+						 "through a bottle of water: millimetres of water (of a "
+						 "ray its chord, 2 sqrt(r^2 - d^2) at a distance d from the bottle's "
+						 "axis), and the line integral measured behind it",
+						 offsetof(struct fit_hardening_options, points), true},
+						{0}};
 
 const struct command command_fit_hardening = {
-    "fit-hardening",  "water's polynomial of beam hardening from a step wedge",
+    "fit-hardening",  "water's polynomial of beam hardening from a step wedge or a bottle",
     positionals,      groups,
     &defaults,        sizeof(defaults),
     fit_hardening_run};

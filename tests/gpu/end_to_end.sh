@@ -149,8 +149,8 @@ if [ -x "$BUILD/cbct-worker-faulty" ]; then
 fi
 
 # What arrives while the arm turns, in any order, what phantoms become and their end slices, what is beside metal, stuck
-# pixels, rings, lag and scatter, and what a job says of its quality: the daemon's own tests.
-parts=(arriving phantom test_metal stuck_pixels rings detector quality)
+# pixels, rings, lag and scatter (fitted and by images), and what a job says of its quality: the daemon's own tests.
+parts=(arriving phantom test_metal stuck_pixels rings detector test_scatter quality)
 if command -v curl >/dev/null && command -v jq >/dev/null; then
 	check "the daemon's tests: ${parts[*]}" env BACKEND=cuda BUILD="$BUILD" tests/run.sh "${parts[@]}"
 else
