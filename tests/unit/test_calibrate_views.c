@@ -539,6 +539,53 @@ START_TEST(like_circles_are_told_apart_where_the_panel_jumps)
 }
 END_TEST
 
+/* A bar hides the highest of the circles in some views: only the balls of the others are there. */
+enum { FIRST_HIDDEN = 5, BEHIND_HIDDEN = 9 };
+static bool is_hidden(int view)
+{
+	return view >= FIRST_HIDDEN && view < BEHIND_HIDDEN;
+}
+
+static int take_behind_a_bar(void *context, int view, float *ret_image, struct error *err)
+{
+	struct arm_scene scene = *(const struct arm_scene *)context;
+	const struct balls lower = {.count = scene.target.balls->count - 8, .ball = scene.target.balls->ball};
+
+	if (is_hidden(view))
+		scene.target.balls = &lower;
+	return arm_image(&scene, view, ret_image, err);
+}
+
+/*
+ * Without the highest of like circles a view looks as one a circle further along the axis, where that circle is beside
+ * the picture: no view is used from there.
+ */
+START_TEST(a_circle_behind_a_bar_moves_no_view)
+{
+	const struct ball_circles like = {.circles = 3, .balls = 8, .diameter = 70, .distance = 18, .ball = 2.5};
+	struct arm_scene scene = {
+	    .arm = {.columns = 160, .rows = 120, .count = 18, .pixel = .9, .step = 200 * M_PI / 180 / 17, .sag = 1}};
+	struct balls balls;
+	struct calibration calibration;
+	struct error err = {0};
+
+	ck_assert(balls_circles(&balls, &like, &err) == 0);
+	scene.target = (struct target){.balls = &balls, .ball = .5, .photons = 20000};
+	ck_assert_msg(arm_calibrate(&scene.arm, take_behind_a_bar, &scene, &balls, false, &calibration, &err) == 0,
+		      "%s", err.text);
+	for (int k = 0; k < calibration.count; k++) {
+		const struct calibrated_view *view = &calibration.views[k];
+
+		ck_assert_msg(view->used || is_hidden(k), "view %d: %s", k, view->refused);
+		if (view->used)
+			ck_assert_msg(arm_wrong(&scene.arm, k, &view->view) <= .2, "view %d is wrong by %.1f pixels", k,
+				      arm_wrong(&scene.arm, k, &view->view));
+	}
+	calibration_clear(&calibration);
+	balls_clear(&balls);
+}
+END_TEST
+
 /*
  * A few balls of another size tell how a phantom stood that is turned by more than half a step: by where the balls are
  * it looks the same a step further.
@@ -589,6 +636,7 @@ Suite *calibrate_views_suite(void)
 	tcase_add_test(tests, a_phantom_of_many_balls_is_found_turned_as_it_stood);
 	tcase_add_loop_test(tests, of_like_circles_each_is_taken_for_itself, 0, sizeof(heights) / sizeof(*heights));
 	tcase_add_test(tests, like_circles_are_told_apart_where_the_panel_jumps);
+	tcase_add_test(tests, a_circle_behind_a_bar_moves_no_view);
 	tcase_add_test(tests, balls_of_another_size_tell_how_a_phantom_stood);
 	suite_add_tcase(suite, tests);
 	return suite;
