@@ -766,6 +766,18 @@ test('a calibration comes into the list, tells its residuals projection by proje
 	expect((await page.textContent('.calibration')).includes(off), `"${off}" in: ${await page.textContent('.calibration')}`)
 	await shoot(page, 'calibration', { fullPage: true })
 
+	/* German words are longer. */
+	const german = await open(browser, `/#/calibrations/${made.id}`, { locale: 'de-DE' })
+	await german.click('.calibration summary:has-text("Als Tabelle")')
+	await german.waitForSelector('.calibration tbody tr')
+	for (const one of [page, german])
+		for (const width of [390, 800, 1280, 1440]) {
+			await one.setViewportSize({ width, height: 900 })
+			const [wide, room] = await one.$eval('.calibration details .scroll', ({ scrollWidth, clientWidth }) => [scrollWidth, clientWidth])
+			expect(wide <= room, `a table no wider than its room of a page of ${width} pixels: ${wide} of ${room}`)
+		}
+	await german.context().close()
+
 	await page.click('button:has-text("Remove …")')
 	await page.click('dialog button:has-text("Keep it")')
 	await page.click('button:has-text("Remove …")')

@@ -302,9 +302,9 @@ export class CalibrationPage {
 		if (!this.details.open)
 			return
 		replace(this.table, h('caption', { class: 'hidden' }, t('Residuals')),
-			h('thead', {}, h('tr', {}, [t('Projection'), t('Shadows'), t('Balls'), t('Residual, pixels'), t('largest'), t('Residual, mm')].map(name => h('th', { scope: 'col' }, name)))),
+			h('thead', {}, h('tr', {}, [t('No.'), t('Shadows'), t('Balls'), t('Residual, pixels'), t('largest'), t('Residual, mm')].map(name => h('th', { scope: 'col' }, name)))),
 			h('tbody', {}, this.#calibration.views.map((view, k) => h('tr', {}, h('th', { scope: 'row' }, String(k)), h('td', {}, String(view.shadows)),
-				view.used ? [String(view.balls), number(view.residual_pixels), number(view.largest_residual_pixels), number(view.residual_isocentre_mm)].map(text => h('td', {}, text))
+				view.used ? [String(view.balls), ...[view.residual_pixels, view.largest_residual_pixels, view.residual_isocentre_mm].map(value => number(value, 2))].map(text => h('td', {}, text))
 					: h('td', { colspan: '4' }, t('refused'))))))
 	}
 

@@ -486,6 +486,7 @@ export const strings = {
 	'Sources': 'Quellen',
 	'{n} times as far as the scan has them': '{n}-mal so weit, wie der Scan sie hat',
 	'Residual, mm': 'Residuum, mm',
+	'No.': 'Nr.',
 	'Balls moved by': 'Kugeln verschoben um',
 	'Asked for by': 'Angefordert von',
 	'A scan of the same sweep has this member in its document, view by view:': 'Ein Scan desselben Umlaufs hat dies in seinem Dokument, Projektion für Projektion:',
