@@ -223,8 +223,11 @@ void presence_count(struct run *run);
  * picture, and shadows that are of none.
  */
 int presence_unexplained(const struct run *run, int view, const struct pose *pose);
+/* Of these the shadows alone. */
+int presence_strays(const struct run *run, int view, const struct pose *pose);
 
 /* ---- sweep.c ---- */
+enum { STRAY_LEAST = 1 }; /* mm at the detector: below it no view strays from its neighbours */
 /* A view's place in the order of the angles. */
 struct station {
 	double angle; /* radians, -pi to pi, of its nominal source */
@@ -232,10 +235,17 @@ struct station {
 };
 /* All views in that order, the caller's to free; NULL: no memory. */
 struct station *stations_of(const struct geometry *nominal);
-/* Where the sweep begins among its stations: behind its widest gap, the opening of a short scan. */
+/*
+ * Where the sweep begins among its stations: behind its widest gap, the opening of a short scan; of gaps as wide behind
+ * the one between views that are farthest from each other in the list, where a full turn ends as it began.
+ */
 int first_station(const struct station *stations, int count);
-/* Distance of the balls' shadows under one pose from where they are under another: RMS, pixels. */
-double poses_apart(const struct balls *balls, const double pixel_mm[2], const struct pose *a, const struct pose *b);
+/*
+ * Distance of the balls' shadows under one pose from where they are under another: RMS, pixels; and, unless that is
+ * NULL, their mean way there.
+ */
+double poses_apart(const struct balls *balls, const double pixel_mm[2], const struct pose *a, const struct pose *b,
+		   double ret_mean[2]);
 /* Turns source and detector about z. */
 void pose_turn(struct pose *pose, double angle);
 /*

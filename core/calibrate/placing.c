@@ -3,16 +3,16 @@
  * about z, a circle further along it) a view's pose fits its shadows as well, where the balls that make the difference
  * are off the picture. Three things tell of the right one, in this order:
  *
- *   - an arm sags smoothly: of a view's places the one that is nearest to where the view before has the balls is its
- *     own, if the next best is much farther away. So views are chained, each moved to its chain's place;
+ *   - an arm sags smoothly: of a view's places the one that is nearest to where the views before lead is its own, if
+ *     the next best is much farther away, and it is no leap. So views are chained, each moved to its chain's place;
  *   - what all views of a chain show: in another place balls should be on the picture of which nothing is there, and
  *     shadows are there of no ball;
  *   - of places that explain as much the one nearest to the nominal geometry is taken, and that there are others is
  *     told.
  *
- * Where a sweep jumps along the axis, or its end does not meet its beginning, a chain may go on a circle aside. The
- * views behind that surely explain more in another place, and so do views in which a bar hides a circle: both are
- * refused.
+ * A chain may all the same go on a circle aside where the panel jumps about so far. The views behind that surely
+ * explain more in another place, and so do views in which a bar hides a circle: both are refused. Chains beside the
+ * longest are used where their shadows tell how far along the axis they stand.
  */
 #include <limits.h>
 #include <math.h>
@@ -24,7 +24,8 @@
 #include "core/pulse.h"
 #include "core/select.h"
 
-static const double FARTHER = 2; /* times as far as the nearest place is the next one of a view that is chained */
+static const double FARTHER = 2; /* times as far is the next place, or chain, of a view that is surely of the nearest */
+static const double LEAP = 4;    /* times the median over the sweep, which no chain leaps */
 static const double SURE = 2;    /* standard deviations, between the numbers of what is not explained */
 
 /* A view in the order of the sweep. */
@@ -36,7 +37,9 @@ struct stance {
 };
 
 struct chain {
-	int last, count; /* stance; how many */
+	int before, last; /* stances, the last two */
+	int count;
+	int motion; /* of the drawing, by which its views are moved further; -1: not known */
 };
 
 struct placing {
@@ -48,11 +51,18 @@ struct placing {
 	int *motion;            /* [stance] of that chain */
 	int count, chain_count;
 	double axis[2]; /* mm, of the arm's turn, in the drawing's world */
+	double pace[2]; /* pixels for a radian, by which views leave the last, and where the last two lead: medians */
 };
 
 static struct motion sum_of(const struct motion *a, const struct motion *b)
 {
 	return (struct motion){.turn = a->turn + b->turn, .along = a->along + b->along};
+}
+
+/* True of motions that differ by a turn alone; a way along is a mean of equal ones, but for rounding. */
+static bool as_high(const struct motion *a, const struct motion *b)
+{
+	return fabs(a->along - b->along) < 1e-6;
 }
 
 static struct pose moved(const struct stance *stance, const struct motion *further)
@@ -74,53 +84,121 @@ static void turn_on(const struct placing *placing, struct pose *pose, double ang
 		pose->source[a] += placing->axis[a];
 }
 
-/* The motion that brings a view nearest to where another has the balls; false if another does nearly. */
-static bool nearest(const struct placing *placing, const struct stance *last, const struct stance *next,
-		    struct motion *ret_motion)
+/* Radians from a view on to a later one. */
+static double onward(const struct stance *last, const struct stance *next)
 {
-	const struct run *run = placing->run;
-	const struct motions *motions = &run->motions;
-	struct pose expected = moved(last, &motions->motion[0]);
-	double least = INFINITY, second = INFINITY;
+	const double angle = fmod(next->angle - last->angle, 2 * M_PI);
 
-	turn_on(placing, &expected, next->angle - last->angle);
-	for (int m = 0; m < motions->count; m++) {
-		const struct pose pose = moved(next, &motions->motion[m]);
-		const double apart = poses_apart(&run->calibration->balls, run->request->pixel_mm, &pose, &expected);
-
-		if (apart < least) {
-			second = least;
-			least = apart;
-			*ret_motion = motions->motion[m];
-		} else {
-			second = fmin(second, apart);
-		}
-	}
-	return FARTHER * least <= second;
+	return angle < 0 ? angle + 2 * M_PI : angle;
 }
 
-/* Puts a view to the longest chain that it goes on with, or begins one. */
+/* A view's pose once the arm stands at another's angle. */
+static struct pose onwards(const struct placing *placing, const struct stance *stance, double angle)
+{
+	const struct motion none = {0};
+	struct pose pose = moved(stance, &none);
+
+	turn_on(placing, &pose, angle - stance->angle);
+	return pose;
+}
+
+/* How far a view, moved further, has the balls from where a pose has them: pixels. */
+static double apart(const struct placing *placing, const struct stance *stance, const struct motion *further,
+		    const struct pose *expected, double ret_mean[2])
+{
+	const struct pose pose = moved(stance, further);
+
+	return poses_apart(&placing->run->calibration->balls, placing->run->request->pixel_mm, &pose, expected,
+			   ret_mean);
+}
+
+/*
+ * The motion that brings a view nearest to where the last one has the balls, or, if there is one before it, to where
+ * shadows are that go on as they went from there. Writes how near, and how near the next best brings it.
+ */
+static struct motion nearest(const struct placing *placing, const struct stance *before, const struct stance *last,
+			     const struct stance *next, double ret_apart[2])
+{
+	const struct motions *motions = &placing->run->motions;
+	const struct pose expected = onwards(placing, last, next->angle);
+	double far[2][2] = {{INFINITY, INFINITY}, {INFINITY, INFINITY}}, way[2] = {0};
+	int best[2] = {0}, nearer;
+
+	if (before != NULL && onward(before, last) > 0) {
+		const struct pose from = onwards(placing, before, last->angle);
+
+		apart(placing, last, &motions->motion[0], &from, way);
+		for (int e = 0; e < 2; e++)
+			way[e] *= onward(last, next) / onward(before, last);
+	}
+	for (int m = 0; m < motions->count; m++) {
+		double mean[2], square = pow(apart(placing, next, &motions->motion[m], &expected, mean), 2);
+
+		/* As it stood; then as it went on. */
+		for (int k = 0; k < 2; k++) {
+			const double distance = sqrt(fmax(0, square));
+
+			if (distance < far[k][0]) {
+				far[k][1] = far[k][0];
+				far[k][0] = distance;
+				best[k] = m;
+			} else {
+				far[k][1] = fmin(far[k][1], distance);
+			}
+			for (int e = 0; e < 2; e++)
+				square += way[e] * (way[e] - 2 * mean[e]);
+		}
+	}
+	nearer = far[1][0] < far[0][0];
+	ret_apart[0] = far[nearer][0];
+	ret_apart[1] = far[nearer][1];
+	return motions->motion[best[nearer]];
+}
+
+/*
+ * How far a view is from where a chain leads, pixels. INFINITY if it does not go on with the chain: another place is
+ * nearly as near, or it is much farther off than the sweep's views are.
+ */
+static double off_chain(const struct placing *placing, const struct chain *chain, const struct stance *next,
+			struct motion *ret_motion)
+{
+	const struct stance *last = &placing->stances[chain->last];
+	const struct stance *before = chain->count > 1 ? &placing->stances[chain->before] : NULL;
+	const double least = STRAY_LEAST / placing->run->request->pixel_mm[0];
+	double far[2];
+
+	*ret_motion = nearest(placing, before, last, next, far);
+	return FARTHER * far[0] <= far[1] &&
+		       far[0] <= fmax(least, LEAP * placing->pace[before != NULL] * onward(last, next))
+		   ? far[0]
+		   : INFINITY;
+}
+
+/* Puts a view to the longest of the chains that lead about as near to it as any, or begins one. */
 static void chain_view(struct placing *placing, int at)
 {
 	struct stance *stance = &placing->stances[at];
-	struct motion best = {0};
+	const struct chain *chains = placing->chains;
+	struct motion best = {0}, motion;
+	double least = INFINITY;
 	int own = -1;
 
-	for (int c = 0; c < placing->chain_count; c++) {
-		struct motion motion = {0};
-
-		if ((own < 0 || placing->chains[c].count > placing->chains[own].count) &&
-		    nearest(placing, &placing->stances[placing->chains[c].last], stance, &motion)) {
+	stance->motion = best;
+	for (int c = 0; c < placing->chain_count; c++)
+		least = fmin(least, off_chain(placing, &chains[c], stance, &motion));
+	for (int c = 0; c < placing->chain_count && isfinite(least); c++)
+		if ((own < 0 || chains[c].count > chains[own].count) &&
+		    off_chain(placing, &chains[c], stance, &motion) <= FARTHER * least) {
 			own = c;
 			best = motion;
 		}
-	}
 	if (own < 0) {
 		own = placing->chain_count++;
-		placing->chains[own].count = 0;
+		placing->chains[own] = (struct chain){0};
 	}
 	stance->motion = best;
 	stance->chain = own;
+	placing->chains[own].before = placing->chains[own].last;
 	placing->chains[own].last = at;
 	placing->chains[own].count++;
 }
@@ -164,7 +242,7 @@ static double aside(const struct placing *placing, int chain, const struct motio
 			continue;
 		pose = moved(stance, further);
 		squares += pow(poses_apart(&run->calibration->balls, run->request->pixel_mm, &pose,
-					   &run->matches[stance->view].nominal),
+					   &run->matches[stance->view].nominal, NULL),
 			       2);
 	}
 	return squares / placing->chains[chain].count;
@@ -191,7 +269,7 @@ static void tell_rivals(struct calibration *calibration, const struct motions *m
 
 		if (m == own || is_surely_more(missed[m], least))
 			continue;
-		if (motions->motion[m].along == motions->motion[own].along) {
+		if (as_high(&motions->motion[m], &motions->motion[own])) {
 			if (fabs(round) < fabs(turn))
 				turn = round;
 		} else if (fabs(further) < fabs(along)) {
@@ -339,6 +417,86 @@ static int find_axis(struct placing *placing, struct error *err)
 	return 0;
 }
 
+/* How fast views go, each in the place that is nearest to the view before. */
+static int find_pace(struct placing *placing, struct error *err)
+{
+	float *paces[2] = {malloc((size_t)placing->count * sizeof(float)),
+			   malloc((size_t)placing->count * sizeof(float))};
+	int count[2] = {0}, code = 0;
+
+	if (paces[0] == NULL || paces[1] == NULL)
+		code = error_set(err, ERR_NO_MEMORY, "no memory for %d views", placing->count);
+	for (int i = 1; i < placing->count && code == 0; i++) {
+		struct stance *next = &placing->stances[i];
+
+		for (int k = i > 1; k >= 0 && onward(next - 1, next) > 0; k--) {
+			double far[2];
+			const struct motion motion = nearest(placing, k > 0 ? next - 2 : NULL, next - 1, next, far);
+
+			paces[k][count[k]++] = (float)(far[0] / onward(next - 1, next));
+			next->motion = k == 0 ? motion : next->motion;
+		}
+	}
+	for (int k = 0; k < 2 && code == 0; k++)
+		placing->pace[k] = count[k] > 0 ? select_kth(paces[k], count[k], count[k] / 2) : 0;
+	free(paces[0]);
+	free(paces[1]);
+	return code;
+}
+
+/*
+ * The place of a chain that does not go on with the longest one, one of the drawing's motions: nearest to the longest
+ * one's last view before it, of those that leave fewest shadows without a ball. Only these tell: a ball that is not
+ * seen may be behind something. -1 where they leave open how far along the axis it is; a panel jumps along, not around.
+ */
+static int settle_apart(const struct placing *placing, int chain, int longest)
+{
+	const struct motions *motions = &placing->run->motions;
+	const struct stance *first = NULL;
+	struct stance anchor = {.view = -1};
+	struct pose expected;
+	int strays[MOTIONS_MOST] = {0}, least = INT_MAX, own = -1;
+	double far[2] = {INFINITY, INFINITY};
+
+	for (int i = 0; i < placing->count; i++) {
+		const struct stance *stance = &placing->stances[i];
+
+		if (stance->chain == longest && (first == NULL || anchor.view < 0))
+			anchor = *stance;
+		if (stance->chain == chain && first == NULL)
+			first = stance;
+	}
+#pragma omp parallel for schedule(dynamic) reduction(+ : strays[:MOTIONS_MOST])
+	for (int i = 0; i < placing->count; i++)
+		for (int m = 0; m < motions->count && placing->stances[i].chain == chain; m++) {
+			const struct pose pose = moved(&placing->stances[i], &motions->motion[m]);
+
+			strays[m] += presence_strays(placing->run, placing->stances[i].view, &pose);
+		}
+	pulse_beat();
+	anchor.motion = sum_of(&anchor.motion, &motions->motion[placing->chains[longest].motion]);
+	expected = onwards(placing, &anchor, first->angle);
+	for (int m = 0; m < motions->count; m++)
+		least = strays[m] < least ? strays[m] : least;
+	for (int m = 0; m < motions->count; m++) {
+		double from;
+
+		if (is_surely_more(strays[m], least))
+			continue;
+		from = apart(placing, first, &motions->motion[m], &expected, NULL);
+		if (own >= 0 && !as_high(&motions->motion[m], &motions->motion[own]))
+			return -1;
+		if (from < far[0]) {
+			far[1] = far[0];
+			far[0] = from;
+			own = m;
+		} else {
+			far[1] = fmin(far[1], from);
+		}
+	}
+	return FARTHER * far[0] <= far[1] ? own : -1;
+}
+
 /* Refuses the views beside the longest chain, and writes where the others are moved to. */
 static void decide(struct placing *placing, double *turn, struct pose *poses, bool *is_moved)
 {
@@ -353,13 +511,18 @@ static void decide(struct placing *placing, double *turn, struct pose *poses, bo
 	own = settle(placing, longest, missed);
 	tell_rivals(calibration, motions, missed, own, follow_evidence(placing, longest, own, placing->motion));
 	*turn = remainder(*turn - motions->motion[own].turn, 2 * M_PI);
+	placing->chains[longest].motion = own;
+	for (int c = 0; c < placing->chain_count; c++)
+		if (c != longest)
+			placing->chains[c].motion =
+			    calibration->rival_height != 0 ? -1 : settle_apart(placing, c, longest);
 	for (int i = 0; i < placing->count; i++) {
 		const struct stance *stance = &placing->stances[i];
 		struct calibrated_view *view = &calibration->views[stance->view];
-		const struct motion *further;
+		const struct chain *chain = &placing->chains[stance->chain];
 		struct motion motion;
 
-		if (stance->chain != longest) {
+		if (chain->motion < 0) {
 			view->used = false;
 			snprintf(view->refused, sizeof(view->refused),
 				 "it may as well see the phantom from another place, where it looks the same: the %d "
@@ -367,7 +530,7 @@ static void decide(struct placing *placing, double *turn, struct pose *poses, bo
 				 placing->chains[longest].count, placing->count);
 			continue;
 		}
-		if (placing->motion[i] != own) {
+		if (stance->chain == longest && placing->motion[i] != own) {
 			view->used = false;
 			snprintf(
 			    view->refused, sizeof(view->refused),
@@ -375,10 +538,9 @@ static void decide(struct placing *placing, double *turn, struct pose *poses, bo
 			    "from that of most views");
 			continue;
 		}
-		further = &motions->motion[own];
-		motion = sum_of(&stance->motion, further);
+		motion = sum_of(&stance->motion, &motions->motion[chain->motion]);
 		is_moved[stance->view] = motion.turn != 0 || motion.along != 0;
-		poses[stance->view] = moved(stance, further);
+		poses[stance->view] = moved(stance, &motions->motion[chain->motion]);
 	}
 }
 
@@ -403,6 +565,8 @@ int place_views(struct run *run, double *turn, struct error *err)
 		take_stances(&placing, stations);
 	if (placing.count > 0 && run->motions.count > 1) {
 		code = find_axis(&placing, err);
+		if (code == 0)
+			code = find_pace(&placing, err);
 		if (code == 0) {
 			decide(&placing, turn, poses, is_moved);
 			code = find_moved(run, poses, is_moved, err);

@@ -114,6 +114,14 @@ int presence_unexplained(const struct run *run, int view, const struct pose *pos
 	return unexplained;
 }
 
+int presence_strays(const struct run *run, int view, const struct pose *pose)
+{
+	struct places places;
+
+	places_of(run, pose, &places);
+	return count_strays(run, view, &places);
+}
+
 void presence_count(struct run *run)
 {
 	struct calibration *calibration = run->calibration;

@@ -14,7 +14,6 @@
 #include "core/select.h"
 
 static const double GAP_MOST = 30 * M_PI / 180; /* between the neighbours of a view that is held against them */
-static const double STRAY_LEAST = 1;            /* mm at the detector: below it no view strays */
 static const double STRAY_FACTOR = 8;           /* of the median over the views */
 
 static int station_order(const void *a, const void *b)
@@ -38,29 +37,31 @@ struct station *stations_of(const struct geometry *nominal)
 	return stations;
 }
 
-int first_station(const struct station *stations, int count)
-{
-	double widest = -1;
-	int first = 0;
-
-	for (int i = 0; i < count; i++) {
-		const double gap = remainder(stations[i].angle - stations[(i + count - 1) % count].angle, 2 * M_PI);
-		const double onward = gap < 0 ? gap + 2 * M_PI : gap;
-
-		if (onward > widest + 1e-9) {
-			widest = onward;
-			first = i;
-		}
-	}
-	return first;
-}
-
 /* Angle from one direction on to another, 0 to 2 pi. */
 static double onward(double from, double to)
 {
 	const double angle = fmod(to - from, 2 * M_PI);
 
 	return angle < 0 ? angle + 2 * M_PI : angle;
+}
+
+int first_station(const struct station *stations, int count)
+{
+	double widest = -1;
+	int first = 0, farthest = 0;
+
+	for (int i = 0; i < count; i++) {
+		const struct station *last = &stations[(i + count - 1) % count];
+		const double gap = onward(last->angle, stations[i].angle);
+		const int far = abs(stations[i].view - last->view);
+
+		if (gap > widest + 1e-9 || (gap > widest - 1e-9 && far > farthest)) {
+			widest = fmax(gap, widest);
+			farthest = far;
+			first = i;
+		}
+	}
+	return first;
 }
 
 static void turn_about_z(double v[3], double angle)
@@ -193,17 +194,23 @@ static void neighbours(const struct calibration *calibration, const struct stati
 
 static const int none_aside[2] = {0};
 
-double poses_apart(const struct balls *balls, const double pixel_mm[2], const struct pose *a, const struct pose *b)
+double poses_apart(const struct balls *balls, const double pixel_mm[2], const struct pose *a, const struct pose *b,
+		   double ret_mean[2])
 {
-	double squares = 0;
+	double squares = 0, sums[2] = {0};
 
 	for (int i = 0; i < balls->count; i++) {
 		double is[2] = {0}, should[2] = {0};
 
 		pose_shadow(a, pixel_mm, &balls->ball[i], is);
 		pose_shadow(b, pixel_mm, &balls->ball[i], should);
-		squares += (is[0] - should[0]) * (is[0] - should[0]) + (is[1] - should[1]) * (is[1] - should[1]);
+		for (int e = 0; e < 2; e++) {
+			squares += (is[e] - should[e]) * (is[e] - should[e]);
+			sums[e] += is[e] - should[e];
+		}
 	}
+	for (int e = 0; e < 2 && ret_mean != NULL; e++)
+		ret_mean[e] = sums[e] / balls->count;
 	return sqrt(squares / balls->count);
 }
 
@@ -215,7 +222,7 @@ static double apart(const struct calibration *calibration, const struct calibrat
 
 	pose_of_view(&own, view);
 	pose_of_view(&expected, other);
-	return poses_apart(&calibration->balls, request->pixel_mm, &own, &expected);
+	return poses_apart(&calibration->balls, request->pixel_mm, &own, &expected, NULL);
 }
 
 /* How a view that is not used gets its pose. */
