@@ -5,6 +5,7 @@
 #include <math.h>
 
 #include "core/calibrate/internal.h"
+#include "core/select.h"
 
 static const double CLEARANCE = 2;       /* pixels between shadows that do not touch */
 static const double EDGE = 1.5;          /* radii from the picture's edge */
@@ -88,29 +89,57 @@ static void places_of(const struct run *run, const struct pose *pose, struct pla
 	}
 }
 
+/* The shadow nearest to a ball's place, if it covers that; else NULL. */
+static const struct shadow *shadow_at(const struct work *work, const double place[2], double radius)
+{
+	const struct shadow *nearest = NULL;
+
+	for (int s = 0; s < work->count; s++) {
+		const double distance = hypot(work->shadows[s].column - place[0], work->shadows[s].row - place[1]);
+
+		if (distance <= radius) {
+			radius = distance;
+			nearest = &work->shadows[s];
+		}
+	}
+	return nearest;
+}
+
+/*
+ * Sizes are held against each other: a drawing whose balls are all too large or too small, or shadows that a detector
+ * blurs, tell no place.
+ */
 int presence_unexplained(const struct run *run, int view, const struct pose *pose)
 {
 	/* Half of the way from one size of the phantom to the other. */
-	const double unlike = fmax(SIZE_OTHER, .5 * log(run->most / run->least));
-	const struct work *work = &run->works[view];
+	const double unlike =
+	    run->most < TWO_SIZES * run->least ? INFINITY : fmax(SIZE_OTHER, .5 * log(run->most / run->least));
 	struct places places;
-	int unexplained;
+	float sizes[BALLS_MOST], sorted[BALLS_MOST];
+	int unexplained, found = 0;
+	double usual;
 
 	places_of(run, pose, &places);
 	unexplained = count_strays(run, view, &places);
 	for (int b = 0; b < run->calibration->balls.count; b++) {
 		const double *place = places.place[b], radius = places.radius[b];
-		bool found = !on_picture(run->request->nominal, place, radius) ||
-			     !stands_clear(&places, run->calibration->balls.count, b, place, radius);
+		const struct shadow *shadow;
 
-		for (int s = 0; s < work->count && !found; s++) {
-			const struct shadow *shadow = &work->shadows[s];
-
-			found = hypot(shadow->column - place[0], shadow->row - place[1]) <= radius &&
-				(run->most < TWO_SIZES * run->least || fabs(log(shadow->radius / radius)) <= unlike);
+		if (!on_picture(run->request->nominal, place, radius) ||
+		    !stands_clear(&places, run->calibration->balls.count, b, place, radius))
+			continue;
+		shadow = shadow_at(&run->works[view], place, radius);
+		if (shadow != NULL) {
+			sizes[found] = (float)log(shadow->radius / radius);
+			sorted[found] = sizes[found];
+			found++;
+		} else {
+			unexplained++;
 		}
-		unexplained += !found;
 	}
+	usual = found > 0 ? select_kth(sorted, found, found / 2) : 0;
+	for (int i = 0; i < found; i++)
+		unexplained += fabs(sizes[i] - usual) > unlike;
 	return unexplained;
 }
 

@@ -660,6 +660,44 @@ START_TEST(balls_of_another_size_tell_how_a_phantom_stood)
 }
 END_TEST
 
+/* Of balls of two sizes, all shadows wider than drawn are explained; of two that are exchanged neither is. */
+START_TEST(sizes_are_held_against_each_other)
+{
+	static const double wide = 1.25, pixel_mm[2] = {1.1, 1.1};
+	const struct arm arm = {.columns = 200, .rows = 116, .count = 1, .pixel = 1.1, .step = 1};
+	struct ball_circles dense = {.circles = 2, .balls = 7, .diameter = 90, .distance = 45, .ball = 3, .shift = .3};
+	struct shadow shadows[14];
+	struct work work = {.shadows = shadows, .count = 14};
+	struct geometry nominal;
+	struct calibration calibration = {.count = 1};
+	const struct calibrate_request request = {.nominal = &nominal, .pixel_mm = pixel_mm};
+	const struct run run = {
+	    .request = &request, .calibration = &calibration, .works = &work, .least = 3, .most = 4.05};
+	struct balls *balls = &calibration.balls;
+	struct pose pose;
+	struct error err = {0};
+
+	ck_assert(arm_nominal_geometry(&arm, &nominal, &err) == 0);
+	ck_assert(balls_circles(balls, &dense, &err) == 0);
+	pose_of_view(&pose, &nominal.views[0]);
+	for (int b = 0; b < 14; b++) {
+		double pixel[2];
+
+		balls->ball[b].diameter = b % 3 == 0 ? run.most : run.least;
+		shadows[b].radius = wide * pose_shadow(&pose, pixel_mm, &balls->ball[b], pixel);
+		shadows[b].column = pixel[0];
+		shadows[b].row = pixel[1];
+		shadows[b].likeness = 1;
+	}
+	ck_assert_int_eq(presence_unexplained(&run, 0, &pose), 0);
+	balls->ball[3].diameter = run.least;
+	balls->ball[4].diameter = run.most;
+	ck_assert_int_eq(presence_unexplained(&run, 0, &pose), 2);
+	balls_clear(balls);
+	geometry_clear(&nominal);
+}
+END_TEST
+
 Suite *calibrate_views_suite(void)
 {
 	Suite *suite = suite_create("calibrate_views");
@@ -680,6 +718,7 @@ Suite *calibrate_views_suite(void)
 	tcase_add_loop_test(tests, like_circles_are_told_apart_where_the_panel_jumps, 0,
 			    sizeof(raised) / sizeof(*raised));
 	tcase_add_test(tests, a_circle_behind_a_bar_moves_no_view);
+	tcase_add_test(tests, sizes_are_held_against_each_other);
 	tcase_add_test(tests, balls_of_another_size_tell_how_a_phantom_stood);
 	suite_add_tcase(suite, tests);
 	return suite;
