@@ -223,6 +223,19 @@ static int use_touching(const struct run *run, int view, const struct pose *firs
 	return used;
 }
 
+/* "on a line", "in a plane" or, for balls of pairs that lie in three directions across each other, "". */
+static const char *flat_pairs(const struct run *run, const struct pair *pairs, int count)
+{
+	struct ball own[BALLS_MOST];
+	const struct balls balls = {.count = count, .ball = own};
+	double extent[3];
+
+	for (int i = 0; i < count; i++)
+		own[i] = run->calibration->balls.ball[pairs[i].ball];
+	balls_extent(&balls, extent);
+	return balls_flat(extent);
+}
+
 /* A first pose from a view's pairs; the pairs that do not agree with it are dropped. Negative, with the reason, for
  * none. */
 static int first_pose(const struct run *run, int view, bool again, struct pair *pairs, int matched,
@@ -238,7 +251,17 @@ static int first_pose(const struct run *run, int view, bool again, struct pair *
 		return -1;
 	}
 	if (resect(balls, pairs, matched, pixel_mm, (unsigned)view, ret_pose, ret_agreeing) < 0) {
-		refuse(result, "no pose of source and detector explains six of its %d shadows", matched);
+		const char *flat = flat_pairs(run, pairs, matched);
+
+		if (flat[0] != '\0')
+			refuse(result, "the %d balls that it shows lie nearly %s, which does not determine its pose",
+			       matched, flat);
+		else
+			refuse(
+			    result,
+			    "no pose of source and detector explains six of the %d shadows that are near where %s and "
+			    "this phantom have balls",
+			    matched, again ? "its neighbours" : "the nominal geometry");
 		return -1;
 	}
 	result->rms = pose_fit(ret_pose, pixel_mm, balls, pairs, *ret_agreeing);
@@ -456,17 +479,12 @@ int find_moved(const struct run *run, const struct pose *poses, const bool *move
 static void refuse_open_view(const struct run *run, int view, double open, double limit)
 {
 	const struct work *work = &run->works[view];
-	struct ball own[BALLS_MOST];
-	const struct balls balls = {.count = work->pair_count, .ball = own};
-	double extent[3];
+	const char *flat = flat_pairs(run, work->pairs, work->pair_count);
 
-	for (int i = 0; i < work->pair_count; i++)
-		own[i] = run->calibration->balls.ball[work->pairs[i].ball];
-	balls_extent(&balls, extent);
-	if (balls_flat(extent)[0] != '\0')
+	if (flat[0] != '\0')
 		refuse(&run->calibration->views[view],
 		       "the %d balls that it shows lie nearly %s, which does not determine its pose", work->pair_count,
-		       balls_flat(extent));
+		       flat);
 	else
 		refuse(&run->calibration->views[view],
 		       "the %d balls that it shows leave its pose open by %.1f pixels over all balls, expected at most "

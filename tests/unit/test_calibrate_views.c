@@ -88,6 +88,26 @@ START_TEST(too_many_views_that_fit_are_told_so)
 }
 END_TEST
 
+/* Of three circles most views show the one in the middle alone. */
+START_TEST(views_of_one_circle_are_told_so)
+{
+	const struct ball_circles high = {
+	    .circles = 3, .balls = 8, .diameter = 70, .distance = 26, .ball = 2.5, .shift = .196};
+	struct arm_scene scene = {
+	    .arm = {.columns = 160, .rows = 72, .count = 12, .pixel = .9, .step = 2 * M_PI / 12, .sag = .5}};
+	struct balls balls;
+	struct calibration calibration;
+	struct error err = {0};
+
+	ck_assert(balls_circles(&balls, &high, &err) == 0);
+	scene.target = (struct target){.balls = &balls, .ball = .5, .photons = 20000};
+	ck_assert_int_eq(arm_calibrate(&scene.arm, arm_image, &scene, &balls, false, &calibration, &err),
+			 ERR_IMPOSSIBLE);
+	ck_assert_msg(strstr(err.text, "the 8 balls that it shows lie nearly in a plane") != NULL, "%s", err.text);
+	balls_clear(&balls);
+}
+END_TEST
+
 /* Eleven balls of two sizes, half of them in pairs: a pose that turns the detector and shifts it fits them nearly. */
 static const struct ball pairs_of_balls[] = {
     {{4.9, -54.7, -39.2}, 4.8}, {{6.3, -48.5, -40.8}, 4.8}, {{-28.7, -22.7, -8.1}, 3.5}, {{29, 4.5, 9.5}, 3.5},
@@ -706,6 +726,7 @@ Suite *calibrate_views_suite(void)
 	tcase_set_timeout(tests, 120);
 	tcase_add_test(tests, a_view_of_balls_in_a_plane_is_refused);
 	tcase_add_test(tests, too_many_views_that_fit_are_told_so);
+	tcase_add_test(tests, views_of_one_circle_are_told_so);
 	tcase_add_test(tests, eight_balls_are_enough_in_all_views);
 	tcase_add_loop_test(tests, a_pose_that_fits_nearly_is_not_taken, 0, 3);
 	tcase_add_loop_test(tests, what_poses_between_neighbours_are_worth_is_told, 0, 2);
