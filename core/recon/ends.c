@@ -14,6 +14,8 @@ static const double LITTLE = 0.04, MUCH = 0.15;
 /* Voxels of the body that a slice must have for its means to say something, and at the face for an end to be looked at.
  */
 enum { BODY_LEAST = 16, BODY_AT_FACE = 4 };
+/* The share of a slice further in that a slice at the face has where a body narrows. */
+static const double NARROWER = 0.75;
 /* M is over so many times the reach to either side. */
 enum { WIDE = 4 };
 
@@ -336,16 +338,23 @@ static void spread_slice(struct ends *ends, float *alternate)
 		}
 }
 
+/* Voxels of a slice that the iterate has above half. */
+static int count_of(const struct ends *ends, const float *slice)
+{
+	int count = 0;
+
+	for (size_t i = 0; i < ends->pixels; i++)
+		count += (double)slice[i] > 0.5 * ends->level;
+	return count;
+}
+
 /* True if the body comes as near to the face as the reach. The iterate tells: FDK blurs a body's end across slices. */
 static bool is_at_face(const struct ends *ends, const float *values)
 {
 	for (int slice = 0; slice < ends->reach; slice++) {
 		const size_t at = (size_t)slice * ends->pixels;
-		int count = 0;
 
-		for (size_t i = at; i < at + ends->pixels; i++)
-			count += (double)values[i] > 0.5 * ends->level;
-		if (count >= BODY_AT_FACE)
+		if (count_of(ends, values + at) >= BODY_AT_FACE)
 			return true;
 	}
 	return false;
@@ -399,10 +408,14 @@ static void blend_slice(const struct ends *ends, int slice, double doubt, const 
 	}
 }
 
-/* Change of a slice, means over the body in 1/mm, without its outline, where FDK and iterations differ anywhere. */
+/*
+ * Change of a slice, means over the body in 1/mm: without its outline, where FDK and iterations differ anywhere, NaN
+ * where too little is left to say something; and over all of it.
+ */
 struct slice_change {
 	double corrected; /* of |V' - V| */
 	double departure; /* |of V' - B| */
+	double outlined;  /* of |V' - V|, over all of it */
 };
 
 /* True for a voxel of the body with the body on all four sides in its slice, as far as there are voxels. */
@@ -424,33 +437,58 @@ static bool is_within(const struct ends *ends, const float *start, const float *
 static bool change_of(const struct ends *ends, const float *start, const float *before, const float *after,
 		      struct slice_change *ret_change)
 {
-	double corrected = 0, departure = 0;
-	size_t count = 0;
+	double outlined = 0, corrected = 0, departure = 0;
+	size_t count = 0, within = 0;
 
 	for (int y = 0; y < ends->rows; y++)
 		for (int x = 0; x < ends->columns; x++) {
 			const size_t i = (size_t)y * (size_t)ends->columns + (size_t)x;
+			const double change = fabs((double)after[i] - (double)before[i]);
 
+			if (!is_body(ends, start[i], before[i]))
+				continue;
+			outlined += change;
+			count++;
 			if (!is_within(ends, start, before, x, y))
 				continue;
-			corrected += fabs((double)after[i] - (double)before[i]);
+			corrected += change;
 			departure += (double)after[i] - (double)start[i];
-			count++;
+			within++;
 		}
 	if (count < BODY_LEAST)
 		return false;
-	*ret_change = (struct slice_change){corrected / (double)count, fabs(departure) / (double)count};
+	*ret_change = (struct slice_change){
+	    .corrected = within >= BODY_LEAST ? corrected / (double)within : NAN,
+	    .departure = within >= BODY_LEAST ? fabs(departure) / (double)within : NAN,
+	    .outlined = outlined / (double)count,
+	};
 	return true;
+}
+
+/* True where the body has a quarter less in the slice at the face than as far in as the reach. */
+static bool narrows(const struct ends *ends, const float *before)
+{
+	for (int slice = 0; slice < ends->reach && slice + ends->reach < ends->inner; slice++) {
+		const float *at = before + (size_t)slice * ends->pixels;
+		const int count = count_of(ends, at);
+
+		if (count >= BODY_AT_FACE)
+			return count < NARROWER * count_of(ends, at + (size_t)ends->reach * ends->pixels);
+	}
+	return false;
 }
 
 /*
  * The slices whose change is too large to say nothing of it. The innermost one with enough of the body shows what d is
- * without an end.
+ * without an end. A small body's last slice may be outline alone: it counts where the body narrows, for along a rod
+ * that goes on FDK's blur of the outline is no end.
  */
 static void report_end(const struct ends *ends, int end, struct ends_report *report)
 {
 	const float *start = ends->start + (size_t)(end * ends->zone) * ends->pixels;
 	const float *before = ends->held + (size_t)(end * ends->inner) * ends->pixels;
+	const bool outline = narrows(ends, before);
+	const double little = LITTLE * ends->level;
 	double usual = NAN;
 
 	for (int i = ends->inner - 1; i >= 0; i--) {
@@ -461,7 +499,9 @@ static void report_end(const struct ends *ends, int end, struct ends_report *rep
 			continue;
 		if (isnan(usual))
 			usual = change.departure;
-		if (change.corrected <= LITTLE * ends->level && change.departure - usual <= LITTLE * ends->level)
+		if (outline)
+			change.corrected = fmax(change.corrected, change.outlined);
+		if (!(change.corrected > little) && !(change.departure - usual > little))
 			continue;
 		report->uncertain = true;
 		report->slices[end] = report->slices[end] > i ? report->slices[end] : i + 1;

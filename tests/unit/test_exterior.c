@@ -8,6 +8,7 @@
 #include <string.h>
 
 #include "core/recon/algorithm.h"
+#include "core/recon/ends.h"
 #include "core/recon/recon.h"
 #include "tests/unit/data.h"
 #include "tests/unit/scene.h"
@@ -1007,6 +1008,73 @@ START_TEST(a_rod_that_goes_on_ends_in_no_slice)
 }
 END_TEST
 
+/* MU_WATER in all slices within the radius of the axis, and of that at the face; the two last slices `off` more and
+ * less. */
+static void fill_end(const struct grid *grid, double radius, double at_face, double off, float *ret_voxels)
+{
+	size_t at = 0;
+
+	for (int z = 0; z < grid->size[2]; z++) {
+		const double more = z == 0 ? off : z == 1 ? -off : 0, reach = z == 0 ? at_face : radius;
+
+		for (int y = 0; y < grid->size[1]; y++)
+			for (int x = 0; x < grid->size[0]; x++, at++) {
+				const double place[2] = {grid->origin[0] + x * grid->spacing[0],
+							 grid->origin[1] + y * grid->spacing[1]};
+
+				ret_voxels[at] = hypot(place[0], place[1]) <= reach ? (float)(MU_WATER + more) : 0;
+			}
+	}
+}
+
+/* What a slice of mere outline is changed by is told: of a small ball's last slice next to none has the body on all
+ * four sides, and it was off by 60 to 190 HU with nothing said. */
+START_TEST(the_end_of_something_small_is_told)
+{
+	static const struct {
+		double radius, at_face, off; /* voxels; HU */
+		bool told;
+	} small[] = {
+	    {3, 2.4, 200, true}, {3, 2.4, 30, false}, {1.6, 1, 200, false}, {2.4, 2.4, 200, false}, {5, 5, 200, true}};
+	const struct orbit_spec spec = {24, 16, 12, {620, 1100, {3 * 1100 / 620., 3 * 1100 / 620.}, {0, 0}, {0, 0}},
+					0,  30};
+	const struct grid grid = grid_of(16, 16, 14, 3, 3, 3);
+	float *voxels = malloc(sizeof(float) * grid_voxels(&grid));
+	struct volume *volume;
+	struct device *device;
+	struct orbit orbit;
+	struct scene scene;
+	struct error err;
+
+	ck_assert_ptr_nonnull(voxels);
+	scene_orbit(&scene, &spec);
+	ck_assert_int_eq(orbit_analyse(&orbit, &scene.geometry, &err), 0);
+	ck_assert_int_eq(backend_cpu.open(0, &(struct device_options){0}, &device, &err), 0);
+	ck_assert_int_eq(backend_cpu.volume_new(device, &grid, &volume, &err), 0);
+	for (size_t i = 0; i < sizeof(small) / sizeof(small[0]); i++) {
+		const double radius = small[i].radius * grid.spacing[0], at_face = small[i].at_face * grid.spacing[0];
+		const double off = small[i].off * MU_WATER / 1000;
+		struct ends_report report;
+		struct ends *ends = NULL;
+
+		ck_assert_int_eq(ends_new(&grid, &scene.geometry, &orbit, MU_WATER, true, &ends, &err), 0);
+		fill_end(&grid, radius, at_face, 0, voxels);
+		ck_assert_int_eq(backend_cpu.volume_upload(volume, voxels, &err), 0);
+		ck_assert_int_eq(ends_begin(ends, &backend_cpu, volume, &err), 0);
+		fill_end(&grid, radius, at_face, off, voxels);
+		ck_assert_int_eq(backend_cpu.volume_upload(volume, voxels, &err), 0);
+		ck_assert_int_eq(ends_show(ends, &backend_cpu, volume, &report, &err), 0);
+		ck_assert_msg(report.uncertain == small[i].told, "%zu: %d", i, report.uncertain);
+		ends_free(ends);
+	}
+	backend_cpu.volume_free(volume);
+	backend_cpu.close(device);
+	orbit_clear(&orbit);
+	scene_clear(&scene);
+	free(voxels);
+}
+END_TEST
+
 /* With any number of threads, and behind a yield; the iterate itself goes on as it is. */
 START_TEST(the_end_slices_are_the_same_bits_with_other_threads_and_after_a_yield)
 {
@@ -1081,6 +1149,7 @@ Suite *exterior_suite(void)
 	tcase_add_loop_test(last, the_end_slices_are_no_worse_than_those_of_fdk_where_a_body_ends, 0, COUNT(ended));
 	tcase_add_loop_test(last, the_last_slices_of_a_skull_have_the_mean_that_the_iterate_has, 0, COUNT(skulls));
 	tcase_add_test(last, a_rod_that_goes_on_ends_in_no_slice);
+	tcase_add_test(last, the_end_of_something_small_is_told);
 	tcase_add_loop_test(last, the_end_slices_are_the_same_bits_with_other_threads_and_after_a_yield, 0, 2);
 	suite_add_tcase(suite, last);
 	suite_add_tcase(suite, bits);
