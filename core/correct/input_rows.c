@@ -291,9 +291,9 @@ static int warn_of_unseen_slices(const struct correction_job *job, struct error 
 	if (code == 0 && slices[0] + slices[1] > 0)
 		warning_tell(
 		    job->warnings, "slices_unseen",
-		    "the object goes on beyond the detector's rows, and the first %d and the last %d of %d slices are "
-		    "not seen by all views: FDK's values there are too low, and SART's are estimates from the other "
-		    "views",
+		    "the object goes on beyond the detector's rows, and the first %d and the last %d of %d slices have "
+		    "places that not all views see: FDK's values there are too low, and SART's are estimates from the "
+		    "other views",
 		    slices[0], slices[1], grid->size[2]);
 	return code;
 }

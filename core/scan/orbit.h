@@ -159,9 +159,9 @@ bool orbit_is_in_view(const struct orbit *orbit, const double place[3]);
  * side has more than `most` voxels, their slices where rows meet the axis and as high as those where they are higher;
  * across, the field of view, and along z all slices in which every view has the whole field of view on its rows, not
  * centred where the detector is not. One slice, where its plane meets the axis, for a detector of one row. An orbit
- * that leans so far that this leaves less than half of the height gets the largest box whose part of the field of view
- * all views see, narrower along the lean, and one whose views have next to no height in common the grid of
- * orbit_covering_grid: orbit_unseen_slices counts what some views do not see.
+ * that leans so far that this leaves less than half of the height gets all slices that its axis meets where all views
+ * see the field of view, and one whose views have next to no height in common the grid of orbit_covering_grid:
+ * orbit_unseen_slices counts what some views do not see.
  */
 void orbit_default_grid(const struct orbit *orbit, const struct geometry *geometry, int most, struct grid *ret_grid);
 /*
