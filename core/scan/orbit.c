@@ -481,9 +481,9 @@ static double place_in_arc(const struct orbit *orbit, int view)
 
 bool orbit_fdk_is_sound(const struct orbit *orbit)
 {
-	const double little = 0.2, covered = orbit->arc - orbit->holes;
+	const double lacking = 0.4, leaning = 0.2, covered = orbit->arc - orbit->holes;
 
-	return (!orbit->arc_too_short || covered > M_PI + orbit->fan - little) && orbit->tilt < little;
+	return (!orbit->arc_too_short || covered > M_PI + orbit->fan - lacking) && orbit->tilt < leaning;
 }
 
 double orbit_axis_weight(const struct orbit *orbit, int view)
