@@ -410,6 +410,8 @@ def look(daemon, world):
         seen[path] = document_of(daemon.get(path))
         for view in range(VIEWS):
             seen[f"{path}/projections/{view}"] = daemon.get(f"{path}/projections/{view}")
+        if any(seen[f"{path}/projections/{view}"][0] == 404 for view in range(VIEWS)):
+            seen[path] = document_of(daemon.get(path)) # a file that went under the daemon is met by the first who reads it
         for view in (0, 5, 7) if scan == scans.get("images") else ():
             seen[f"{path}/scatter/{view}"] = daemon.get(f"{path}/scatter/{view}")
     for name, job in jobs.items():
