@@ -121,8 +121,8 @@ int orbit_directions(const struct orbit *orbit);
 /*
  * False where FDK's densities are too low all over the volume, by hundreds of HU, as those of a short arc are, or the
  * rows along which it filters lean: such a volume says nothing of what iterations find. Real sweeps lack some degrees,
- * and that is at the rim: up to 23 iterations are truer with FDK as their start than with the model of the exterior
- * (tests/bench/results/exterior.txt).
+ * and that is at the rim: where it is up to 23 degrees, FDK is a better start of iterations than the model of the
+ * exterior (tests/bench/results/exterior.txt).
  */
 bool orbit_fdk_is_sound(const struct orbit *orbit);
 
