@@ -248,6 +248,21 @@ double poses_apart(const struct balls *balls, const double pixel_mm[2], const st
 		   double ret_mean[2]);
 /* Turns source and detector about z. */
 void pose_turn(struct pose *pose, double angle);
+/* The arm's axis in the drawing's world: a phantom may stand beside it, and lean. */
+struct axis {
+	double frame[3][3]; /* its x, y and z, unit vectors, the last along it */
+	double at[2];       /* mm along these x and y, where it stands */
+};
+void pose_turn_about(struct pose *pose, const struct axis *axis, double angle);
+/* A view's source, in the order of the sweep. */
+struct source {
+	double angle, place[3]; /* radians, nominal; mm */
+};
+/*
+ * The axis goes along the median normal of three sources each, through the median of the points about which sources
+ * turn from a view to the next by their nominal angle: the arm sags, and views may stand elsewhere about the phantom.
+ */
+int arm_axis(const struct source *sources, int count, struct axis *ret_axis, struct error *err);
 /*
  * Refuses views that do not follow their neighbours: from the shift of the balls' shadows against the nominal
  * geometry, which is smooth over a sweep.

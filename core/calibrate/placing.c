@@ -50,7 +50,7 @@ struct placing {
 	int *before;            /* [stance][motion], the view before's motion of the cheapest way there */
 	int *motion;            /* [stance] of that chain */
 	int count, chain_count;
-	double axis[2]; /* mm, of the arm's turn, in the drawing's world */
+	struct axis axis;
 	double pace[2]; /* pixels for a radian, by which views leave the last, and where the last two lead: medians */
 };
 
@@ -74,16 +74,6 @@ static struct pose moved(const struct stance *stance, const struct motion *furth
 	return pose;
 }
 
-/* Turns a pose about the arm's axis. */
-static void turn_on(const struct placing *placing, struct pose *pose, double angle)
-{
-	for (int a = 0; a < 2; a++)
-		pose->source[a] -= placing->axis[a];
-	pose_turn(pose, angle);
-	for (int a = 0; a < 2; a++)
-		pose->source[a] += placing->axis[a];
-}
-
 /* Radians from a view on to a later one. */
 static double onward(const struct stance *last, const struct stance *next)
 {
@@ -98,7 +88,7 @@ static struct pose onwards(const struct placing *placing, const struct stance *s
 	const struct motion none = {0};
 	struct pose pose = moved(stance, &none);
 
-	turn_on(placing, &pose, angle - stance->angle);
+	pose_turn_about(&pose, &placing->axis, angle - stance->angle);
 	return pose;
 }
 
@@ -389,32 +379,20 @@ static void take_stances(struct placing *placing, const struct station *stations
 	}
 }
 
-/*
- * Where the arm's axis is to a phantom that may stand beside it: the median of the points about which sources turn from
- * a view to the next by their nominal angle. The arm sags, and views may stand elsewhere about the phantom.
- */
 static int find_axis(struct placing *placing, struct error *err)
 {
-	float *points = malloc(2 * (size_t)placing->count * sizeof(*points));
-	int count = 0;
+	struct source *sources = malloc((size_t)placing->count * sizeof(*sources));
+	int code;
 
-	if (points == NULL)
+	if (sources == NULL)
 		return error_set(err, ERR_NO_MEMORY, "no memory for %d views", placing->count);
-	for (int i = 1; i < placing->count; i++) {
-		const struct stance *last = &placing->stances[i - 1], *next = &placing->stances[i];
-		const double *from = last->pose.source, *to = next->pose.source, turn = next->angle - last->angle;
-		const double half = tan(.5 * turn);
-
-		/* Half way, and across it. */
-		if (!(fabs(half) > 1e-6))
-			continue;
-		points[count] = (float)(.5 * (from[0] + to[0] - (to[1] - from[1]) / half));
-		points[placing->count + count++] = (float)(.5 * (from[1] + to[1] + (to[0] - from[0]) / half));
+	for (int i = 0; i < placing->count; i++) {
+		sources[i] = (struct source){.angle = placing->stances[i].angle};
+		memcpy(sources[i].place, placing->stances[i].pose.source, sizeof(sources[i].place));
 	}
-	for (int a = 0; a < 2; a++)
-		placing->axis[a] = count > 0 ? select_kth(points + a * placing->count, count, count / 2) : 0;
-	free(points);
-	return 0;
+	code = arm_axis(sources, placing->count, &placing->axis, err);
+	free(sources);
+	return code;
 }
 
 /* How fast views go, each in the place that is nearest to the view before. */

@@ -2,8 +2,8 @@
  * A sweep as a whole: views that do not follow their neighbours, and poses between calibrated views.
  *
  * An arm sags smoothly. Between two views a pose is interpolated in the frame that turns with the arm: source,
- * detector and axes turned back by the source's nominal angle. Smoothness decides nothing else: no view that is used
- * is drawn towards its neighbours.
+ * detector and axes turned back by the source's nominal angle about the arm's axis, which a phantom may stand beside.
+ * Smoothness decides nothing else: no view that is used is drawn towards its neighbours.
  */
 #include <math.h>
 #include <stdbool.h>
@@ -15,6 +15,9 @@
 
 static const double GAP_MOST = 30 * M_PI / 180; /* between the neighbours of a view that is held against them */
 static const double STRAY_FACTOR = 8;           /* of the median over the views */
+/* What a sagging arm's sources make of an axis through the drawing's z: only a phantom stands farther beside it. */
+static const double BESIDE_LEAST = 10;             /* mm */
+static const double LEAN_LEAST = 1.5 * M_PI / 180; /* 16 mm of a source */
 
 static int station_order(const void *a, const void *b)
 {
@@ -95,9 +98,133 @@ static struct pose blend(const struct pose *a, const struct pose *b, double shar
 	return pose;
 }
 
+/* A vector in the axis' frame, or back from there. */
+static void to_frame(const struct axis *axis, bool back, double v[3])
+{
+	const double from[3] = {v[0], v[1], v[2]};
+
+	for (int i = 0; i < 3; i++) {
+		v[i] = 0;
+		for (int k = 0; k < 3; k++)
+			v[i] += (back ? axis->frame[k][i] : axis->frame[i][k]) * from[k];
+	}
+}
+
+void pose_turn_about(struct pose *pose, const struct axis *axis, double angle)
+{
+	double *vectors[4] = {pose->source, pose->axes[0], pose->axes[1], pose->axes[2]};
+
+	for (int i = 0; i < 4; i++)
+		to_frame(axis, false, vectors[i]);
+	for (int a = 0; a < 2; a++)
+		pose->source[a] -= axis->at[a];
+	pose_turn(pose, angle);
+	for (int a = 0; a < 2; a++)
+		pose->source[a] += axis->at[a];
+	for (int i = 0; i < 4; i++)
+		to_frame(axis, true, vectors[i]);
+}
+
+/* The normal of the plane of three sources, on the world's z's side; z where they are in no plane. */
+static void normal_of(const double a[3], const double b[3], const double c[3], double ret_normal[3])
+{
+	double along[3], further[3], size;
+
+	for (int k = 0; k < 3; k++) {
+		along[k] = b[k] - a[k];
+		further[k] = c[k] - a[k];
+	}
+	vec_cross(along, further, ret_normal);
+	size = ret_normal[2] < 0 ? -vec_norm(ret_normal) : vec_norm(ret_normal);
+	for (int k = 0; k < 3; k++)
+		ret_normal[k] = fabs(size) > 0 ? ret_normal[k] / size : k == 2;
+}
+
+/* The frame of an axis along the median normal of sources a third of the sweep apart. Scratch: 3 [count]. */
+static void lean_of(const struct source *sources, int count, float *scratch, double ret_frame[3][3])
+{
+	static const double x[3] = {1, 0, 0};
+	const int third = count / 3;
+	double *z = ret_frame[2], size;
+
+	for (int i = 0; i < third; i++) {
+		double normal[3];
+
+		normal_of(sources[i].place, sources[i + third].place, sources[i + 2 * third].place, normal);
+		for (int a = 0; a < 3; a++)
+			scratch[a * third + i] = (float)normal[a];
+	}
+	for (int a = 0; a < 3; a++)
+		z[a] = third > 0 ? select_kth(scratch + a * third, third, third / 2) : a == 2;
+	size = vec_norm(z);
+	for (int a = 0; a < 3; a++)
+		z[a] /= size;
+	vec_cross(z, x, ret_frame[1]);
+	size = vec_norm(ret_frame[1]);
+	for (int a = 0; a < 3; a++)
+		ret_frame[1][a] = size > 0 ? ret_frame[1][a] / size : a == 1;
+	vec_cross(ret_frame[1], z, ret_frame[0]);
+}
+
+int arm_axis(const struct source *sources, int count, struct axis *ret_axis, struct error *err)
+{
+	float *points = malloc(2 * (size_t)(count + 1) * sizeof(*points));
+	int found = 0;
+
+	if (points == NULL)
+		return error_set(err, ERR_NO_MEMORY, "no memory for %d views", count);
+	lean_of(sources, count, points, ret_axis->frame);
+	for (int i = 1; i < count; i++) {
+		const double half = tan(.5 * (sources[i].angle - sources[i - 1].angle));
+		double from[3], to[3];
+
+		for (int a = 0; a < 3; a++) {
+			from[a] = sources[i - 1].place[a];
+			to[a] = sources[i].place[a];
+		}
+		to_frame(ret_axis, false, from);
+		to_frame(ret_axis, false, to);
+		/* Half way, and across it. */
+		if (!(fabs(half) > 1e-6))
+			continue;
+		points[found] = (float)(.5 * (from[0] + to[0] - (to[1] - from[1]) / half));
+		points[count + found++] = (float)(.5 * (from[1] + to[1] + (to[0] - from[0]) / half));
+	}
+	for (int a = 0; a < 2; a++)
+		ret_axis->at[a] = found > 0 ? select_kth(points + a * count, found, found / 2) : 0;
+	if (hypot(ret_axis->at[0], ret_axis->at[1]) < BESIDE_LEAST && ret_axis->frame[2][2] > cos(LEAN_LEAST))
+		*ret_axis = (struct axis){.frame = {{1, 0, 0}, {0, 1, 0}, {0, 0, 1}}};
+	free(points);
+	return 0;
+}
+
+/* The axis by views, those of a calibration that are used or all of a list. */
+static int find_axis(const struct station *stations, int count, const struct calibration *calibration,
+		     const struct view *views, struct axis *ret_axis, struct error *err)
+{
+	struct source *sources = malloc((size_t)count * sizeof(*sources));
+	int first = first_station(stations, count), used = 0, code;
+
+	if (sources == NULL)
+		return error_set(err, ERR_NO_MEMORY, "no memory for %d views", count);
+	for (int n = 0; n < count; n++) {
+		const struct station *station = &stations[(first + n) % count];
+		const double *source;
+
+		if (calibration != NULL && !calibration->views[station->view].used)
+			continue;
+		source =
+		    calibration != NULL ? calibration->views[station->view].view.source : views[station->view].source;
+		sources[used++] = (struct source){.angle = station->angle, .place = {source[0], source[1], source[2]}};
+	}
+	code = arm_axis(sources, used, ret_axis, err);
+	free(sources);
+	return code;
+}
+
 /* The view at an angle between those of two stations. */
-static struct view between(const struct station *a, const struct view *of_a, const struct station *b,
-			   const struct view *of_b, double angle)
+static struct view between(const struct axis *axis, const struct station *a, const struct view *of_a,
+			   const struct station *b, const struct view *of_b, double angle)
 {
 	const double gap = onward(a->angle, b->angle), share = gap > 0 ? onward(a->angle, angle) / gap : 0;
 	const double pixel_mm[2] = {vec_norm(of_a->column_step), vec_norm(of_a->row_step)};
@@ -106,10 +233,10 @@ static struct view between(const struct station *a, const struct view *of_a, con
 
 	pose_of_view(&from, of_a);
 	pose_of_view(&to, of_b);
-	pose_turn(&from, -a->angle);
-	pose_turn(&to, -b->angle);
+	pose_turn_about(&from, axis, -a->angle);
+	pose_turn_about(&to, axis, -b->angle);
 	pose = blend(&from, &to, share);
-	pose_turn(&pose, angle);
+	pose_turn_about(&pose, axis, angle);
 	pose_view(&pose, pixel_mm, &view);
 	return view;
 }
@@ -136,11 +263,14 @@ int calibration_between(struct geometry *ret_geometry, const struct geometry *no
 {
 	struct station *stations = stations_of(nominal);
 	struct view *found = malloc((size_t)count * sizeof(*found));
+	struct axis axis;
 	double gap_most, beyond_most;
 	int code = 0;
 
 	if (stations == NULL || found == NULL)
 		code = error_set(err, ERR_NO_MEMORY, "no memory for %d views", count);
+	else
+		code = find_axis(stations, nominal->count, NULL, views, &axis, err);
 	gap_most = code == 0 ? fmax(5 * M_PI / 180, 3 * median_gap(stations, nominal->count)) : 0;
 	beyond_most = fmax(.5 * M_PI / 180, gap_most / 6);
 	for (int k = 0; k < count && code == 0; k++) {
@@ -155,11 +285,12 @@ int calibration_between(struct geometry *ret_geometry, const struct geometry *no
 		before = onward(a->angle, angle);
 		after = onward(angle, b->angle);
 		if (before + after <= gap_most)
-			found[k] = between(a, &views[a->view], b, &views[b->view], angle);
+			found[k] = between(&axis, a, &views[a->view], b, &views[b->view], angle);
 		else if (fmin(before, after) <= beyond_most) {
 			const struct station *nearest = before < after ? a : b;
 
-			found[k] = between(nearest, &views[nearest->view], nearest, &views[nearest->view], angle);
+			found[k] =
+			    between(&axis, nearest, &views[nearest->view], nearest, &views[nearest->view], angle);
 		} else
 			code = error_set(err, ERR_IMPOSSIBLE,
 					 "view %d stands at %.2f degrees, %.2f degrees from the nearest calibrated one",
@@ -170,6 +301,22 @@ int calibration_between(struct geometry *ret_geometry, const struct geometry *no
 	free(stations);
 	free(found);
 	return code;
+}
+
+/* A calibration's views in their order. */
+struct sweep {
+	const struct calibration *calibration;
+	struct station *stations; /* owned */
+	struct axis axis;
+};
+
+static int sweep_open(struct sweep *sweep, const struct calibration *calibration, const struct geometry *nominal,
+		      struct error *err)
+{
+	*sweep = (struct sweep){.calibration = calibration, .stations = stations_of(nominal)};
+	if (sweep->stations == NULL)
+		return error_set(err, ERR_NO_MEMORY, "no memory for %d views", calibration->count);
+	return find_axis(sweep->stations, calibration->count, calibration, NULL, &sweep->axis, err);
 }
 
 /*
@@ -232,10 +379,10 @@ enum filling { FILLING_NONE, FILLING_BETWEEN, FILLING_TURNED /* the nearer neigh
  * The view that a station would have were it not used, nor so many on either side: between its neighbours. Across the
  * opening of a short scan nothing is between: the nearer end's pose is turned on. None where no other is used.
  */
-static enum filling view_between(const struct calibration *calibration, const struct station *stations, int at,
-				 const int aside[2], struct view *ret_view)
+static enum filling view_between(const struct sweep *sweep, int at, const int aside[2], struct view *ret_view)
 {
-	const struct station *side[2];
+	const struct calibration *calibration = sweep->calibration;
+	const struct station *stations = sweep->stations, *side[2];
 	double to[2];
 
 	neighbours(calibration, stations, at, aside, side);
@@ -245,26 +392,26 @@ static enum filling view_between(const struct calibration *calibration, const st
 	to[1] = onward(stations[at].angle, side[1]->angle);
 	if (to[0] + to[1] > GAP_MOST)
 		side[to[0] < to[1] ? 1 : 0] = side[to[0] < to[1] ? 0 : 1];
-	*ret_view = between(side[0], &calibration->views[side[0]->view].view, side[1],
+	*ret_view = between(&sweep->axis, side[0], &calibration->views[side[0]->view].view, side[1],
 			    &calibration->views[side[1]->view].view, stations[at].angle);
 	return side[0] == side[1] ? FILLING_TURNED : FILLING_BETWEEN;
 }
 
 /* Distance of a view's shadows from where its neighbours' poses have them: RMS over the balls, pixels. */
-static double stray(const struct calibration *calibration, const struct calibrate_request *request,
-		    const struct station *stations, int at)
+static double stray(const struct sweep *sweep, const struct calibrate_request *request, int at)
 {
 	struct view view;
 
-	if (view_between(calibration, stations, at, none_aside, &view) != FILLING_BETWEEN)
+	if (view_between(sweep, at, none_aside, &view) != FILLING_BETWEEN)
 		return 0;
-	return apart(calibration, request, &calibration->views[stations[at].view].view, &view);
+	return apart(sweep->calibration, request, &sweep->calibration->views[sweep->stations[at].view].view, &view);
 }
 
 /* Refuses the view that strays most, when it strays too far; a stray view also draws its neighbours' figures up. */
 static bool refuse_farthest(struct calibration *calibration, const struct calibrate_request *request,
-			    const struct station *stations, float *scratch)
+			    const struct sweep *sweep, float *scratch)
 {
+	const struct station *stations = sweep->stations;
 	double most = 0, limit;
 	int count = 0, worst = 0;
 
@@ -273,7 +420,7 @@ static bool refuse_farthest(struct calibration *calibration, const struct calibr
 
 		if (!calibration->views[stations[i].view].used)
 			continue;
-		far = stray(calibration, request, stations, i);
+		far = stray(sweep, request, i);
 		scratch[count++] = (float)far;
 		if (far > most) {
 			most = far;
@@ -294,16 +441,15 @@ static bool refuse_farthest(struct calibration *calibration, const struct calibr
 
 int sweep_refuse(struct calibration *calibration, const struct calibrate_request *request, struct error *err)
 {
-	struct station *stations = stations_of(request->nominal);
 	float *scratch = malloc((size_t)calibration->count * sizeof(*scratch));
-	int code = 0;
+	struct sweep sweep = {0};
+	int code = scratch != NULL ? sweep_open(&sweep, calibration, request->nominal, err)
+				   : error_set(err, ERR_NO_MEMORY, "no memory for %d views", calibration->count);
 
-	if (stations == NULL || scratch == NULL)
-		code = error_set(err, ERR_NO_MEMORY, "no memory for %d views", calibration->count);
 	for (int i = 0; i < calibration->count / 4 && code == 0; i++)
-		if (!refuse_farthest(calibration, request, stations, scratch))
+		if (!refuse_farthest(calibration, request, &sweep, scratch))
 			break;
-	free(stations);
+	free(sweep.stations);
 	free(scratch);
 	return code;
 }
@@ -311,18 +457,17 @@ int sweep_refuse(struct calibration *calibration, const struct calibrate_request
 int sweep_between(const struct calibration *calibration, const struct geometry *nominal, struct view *ret_views,
 		  struct error *err)
 {
-	struct station *stations = stations_of(nominal);
+	struct sweep sweep;
+	int code = sweep_open(&sweep, calibration, nominal, err);
 
-	if (stations == NULL)
-		return error_set(err, ERR_NO_MEMORY, "no memory for %d views", calibration->count);
-	for (int i = 0; i < calibration->count; i++) {
-		struct view *view = &ret_views[stations[i].view];
+	for (int i = 0; i < calibration->count && code == 0; i++) {
+		const int k = sweep.stations[i].view;
 
-		if (view_between(calibration, stations, i, none_aside, view) == FILLING_NONE)
-			*view = calibration->views[stations[i].view].view;
+		if (view_between(&sweep, i, none_aside, &ret_views[k]) == FILLING_NONE)
+			ret_views[k] = calibration->views[k].view;
 	}
-	free(stations);
-	return 0;
+	free(sweep.stations);
+	return code;
 }
 
 int sweep_fill(struct calibration *calibration, const struct geometry *nominal, struct error *err)
@@ -352,22 +497,23 @@ static int longest_run(const struct calibration *calibration, const struct stati
 
 int sweep_error(struct calibration *calibration, const struct calibrate_request *request, struct error *err)
 {
-	struct station *stations = stations_of(request->nominal);
 	const double isocentre[3] = {0};
+	struct sweep sweep;
 	double squares[3] = {0}, squares_isocentre[3] = {0}, count[3] = {0};
 	enum filling asked = FILLING_NONE;
-	int aside[2];
+	int aside[2], code = sweep_open(&sweep, calibration, request->nominal, err);
 
-	if (stations == NULL)
-		return error_set(err, ERR_NO_MEMORY, "no memory for %d views", calibration->count);
-	aside[1] = longest_run(calibration, stations) - 1;
+	if (code < 0) {
+		free(sweep.stations);
+		return code;
+	}
+	aside[1] = longest_run(calibration, sweep.stations) - 1;
 	aside[0] = aside[1] / 2;
 	aside[1] -= aside[0];
 	for (int i = 0; i < calibration->count; i++) {
-		const struct calibrated_view *view = &calibration->views[stations[i].view];
+		const struct calibrated_view *view = &calibration->views[sweep.stations[i].view];
 		struct view expected;
-		const enum filling filling =
-		    view_between(calibration, stations, i, view->used ? aside : none_aside, &expected);
+		const enum filling filling = view_between(&sweep, i, view->used ? aside : none_aside, &expected);
 		struct pose pose;
 		double pixels, pixel[2];
 
@@ -381,7 +527,7 @@ int sweep_error(struct calibration *calibration, const struct calibrate_request 
 		squares[filling] += pixels * pixels;
 		squares_isocentre[filling] += pow(pixels / pose_project(&pose, request->pixel_mm, isocentre, pixel), 2);
 	}
-	free(stations);
+	free(sweep.stations);
 	if (asked == FILLING_NONE)
 		asked = count[FILLING_BETWEEN] > 0 ? FILLING_BETWEEN : FILLING_TURNED;
 	calibration->between = sqrt(squares[asked] / fmax(1, count[asked]));

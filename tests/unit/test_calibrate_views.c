@@ -389,6 +389,31 @@ START_TEST(views_of_a_flat_phantom_begin_from_their_neighbours)
 }
 END_TEST
 
+/* A phantom that stands beside the axis and leans: its neighbours turn about the arm's axis, not about the drawing's.
+ */
+START_TEST(a_phantom_may_stand_beside_the_axis_and_lean)
+{
+	static const double shift[3] = {35, -10, 3};
+	struct arm_scene scene = {.arm = arm_coarse};
+	struct balls balls, drawing;
+	struct calibration calibration;
+	struct error err = {0};
+
+	ck_assert(balls_circles(&drawing, &circles, &err) == 0);
+	ck_assert(balls_circles(&balls, &circles, &err) == 0);
+	for (int b = 0; b < balls.count; b++)
+		tilt_and_shift(&balls.ball[b], .12, shift);
+	scene.target = (struct target){.balls = &balls, .ball = .4, .photons = 20000};
+	ck_assert_msg(arm_calibrate(&scene.arm, arm_image, &scene, &drawing, false, &calibration, &err) == 0, "%s",
+		      err.text);
+	ck_assert_int_eq(calibration.used, calibration.count);
+	ck_assert_double_le(calibration.between, 2);
+	calibration_clear(&calibration);
+	balls_clear(&balls);
+	balls_clear(&drawing);
+}
+END_TEST
+
 /*
  * Like circles one above the other, of which those at an end are partly or wholly beside the picture: those that a view
  * shows could be the next ones as well. What all views show tells, or that it is not known is told.
@@ -733,6 +758,7 @@ Suite *calibrate_views_suite(void)
 	tcase_add_loop_test(tests, a_ball_more_or_less_is_told, 0, sizeof(presences) / sizeof(*presences));
 	tcase_add_loop_test(tests, views_of_a_flat_phantom_begin_from_their_neighbours, 0,
 			    sizeof(flat) / sizeof(*flat));
+	tcase_add_test(tests, a_phantom_may_stand_beside_the_axis_and_lean);
 	tcase_add_test(tests, a_pose_is_found_down_a_long_valley);
 	tcase_add_test(tests, a_phantom_of_many_balls_is_found_turned_as_it_stood);
 	tcase_add_loop_test(tests, of_like_circles_each_is_taken_for_itself, 0, sizeof(heights) / sizeof(*heights));
