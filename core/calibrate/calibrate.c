@@ -312,6 +312,28 @@ static void tell_misfit(const struct run *run, double turn, double residual, cha
 	}
 }
 
+/*
+ * Balls of two sizes that lie elsewhere than drawn, as those of a helix upside down, whose code read backwards is wrong
+ * in more than a tenth (balls.c).
+ */
+static int check_sizes(const struct calibration *calibration, struct error *err)
+{
+	int seen = 0, unlike = 0;
+
+	for (int b = 0; b < calibration->balls.count; b++) {
+		const struct ball_presence *presence = &calibration->presence[b];
+
+		seen += presence->sized > 0;
+		unlike += 2 * presence->unlike > presence->sized;
+	}
+	if (10 * unlike <= seen)
+		return 0;
+	return error_set(err, ERR_IMPOSSIBLE,
+			 "%d of %d balls have shadows of another of the phantom's sizes than the drawing has there, "
+			 "expected a tenth at most: it has another code or order of balls, or stands upside down",
+			 unlike, seen);
+}
+
 static int check_result(const struct run *run, double turn, struct error *err)
 {
 	const struct calibration *calibration = run->calibration;
@@ -327,6 +349,8 @@ static int check_result(const struct run *run, double turn, struct error *err)
 				 calibration->count - calibration->used, calibration->count, how,
 				 view - calibration->views, view->refused);
 	}
+	if (check_sizes(calibration, err) < 0)
+		return err->code;
 	if (fabs(ratio - 1) > DIAMETER_TOLERANCE)
 		return error_set(
 		    err, ERR_IMPOSSIBLE,

@@ -104,6 +104,8 @@ struct calibrated_view {
 /* Views that are used and should show a ball clear of others', and those of them in which its shadow was. */
 struct ball_presence {
 	int expected, found;
+	int sized,
+	    unlike; /* views in which it stands clear and a shadow is in its place; in which that has another size */
 };
 
 struct calibration {

@@ -105,41 +105,63 @@ static const struct shadow *shadow_at(const struct work *work, const double plac
 	return nearest;
 }
 
-/*
- * Sizes are held against each other: a drawing whose balls are all too large or too small, or shadows that a detector
- * blurs, tell no place.
- */
-int presence_unexplained(const struct run *run, int view, const struct pose *pose)
-{
-	/* Half of the way from one size of the phantom to the other. */
-	const double unlike =
-	    run->most < TWO_SIZES * run->least ? INFINITY : fmax(SIZE_OTHER, .5 * log(run->most / run->least));
-	struct places places;
-	float sizes[BALLS_MOST], sorted[BALLS_MOST];
-	int unexplained, found = 0;
-	double usual;
+/* Balls that stand clear on a picture. */
+struct clear {
+	int ball[BALLS_MOST];   /* that have a shadow in their place */
+	float size[BALLS_MOST]; /* log, of its radius over the expected one, against the median of these */
+	int count, missing;     /* that have none */
+};
 
-	places_of(run, pose, &places);
-	unexplained = count_strays(run, view, &places);
+static void clear_balls(const struct run *run, int view, const struct places *places, struct clear *ret)
+{
+	float sorted[BALLS_MOST];
+	float usual;
+
+	ret->count = ret->missing = 0;
 	for (int b = 0; b < run->calibration->balls.count; b++) {
-		const double *place = places.place[b], radius = places.radius[b];
+		const double *place = places->place[b], radius = places->radius[b];
 		const struct shadow *shadow;
 
 		if (!on_picture(run->request->nominal, place, radius) ||
-		    !stands_clear(&places, run->calibration->balls.count, b, place, radius))
+		    !stands_clear(places, run->calibration->balls.count, b, place, radius))
 			continue;
 		shadow = shadow_at(&run->works[view], place, radius);
 		if (shadow != NULL) {
-			sizes[found] = (float)log(shadow->radius / radius);
-			sorted[found] = sizes[found];
-			found++;
+			ret->ball[ret->count] = b;
+			ret->size[ret->count] = (float)log(shadow->radius / radius);
+			sorted[ret->count] = ret->size[ret->count];
+			ret->count++;
 		} else {
-			unexplained++;
+			ret->missing++;
 		}
 	}
-	usual = found > 0 ? select_kth(sorted, found, found / 2) : 0;
-	for (int i = 0; i < found; i++)
-		unexplained += fabs(sizes[i] - usual) > unlike;
+	usual = ret->count > 0 ? select_kth(sorted, ret->count, ret->count / 2) : 0;
+	for (int i = 0; i < ret->count; i++)
+		ret->size[i] -= usual;
+}
+
+/*
+ * How far a shadow's size is from a ball's own, as log, to be another's: half of the way from one size of the phantom
+ * to the other. Sizes are held against each other: a drawing whose balls are all too large or too small, or shadows
+ * that a detector blurs, tell nothing.
+ */
+static double other_size(const struct run *run)
+{
+	return run->most < TWO_SIZES * run->least ? INFINITY : fmax(SIZE_OTHER, .5 * log(run->most / run->least));
+}
+
+int presence_unexplained(const struct run *run, int view, const struct pose *pose)
+{
+	const double unlike = other_size(run);
+	struct places places;
+	struct clear clear;
+	int unexplained;
+
+	places_of(run, pose, &places);
+	clear_balls(run, view, &places, &clear);
+	unexplained = count_strays(run, view, &places) + clear.missing;
+	for (int i = 0; i < clear.count; i++)
+		unexplained += fabsf(clear.size[i]) > unlike;
 	return unexplained;
 }
 
@@ -154,15 +176,22 @@ int presence_strays(const struct run *run, int view, const struct pose *pose)
 void presence_count(struct run *run)
 {
 	struct calibration *calibration = run->calibration;
+	const double unlike = other_size(run);
 
 	for (int k = 0; k < calibration->count; k++) {
 		struct places places;
+		struct clear clear;
 		int strays;
 
 		if (!calibration->views[k].used)
 			continue;
 		places_of(run, &run->works[k].pose, &places);
 		count_balls(run, k, &places);
+		clear_balls(run, k, &places, &clear);
+		for (int i = 0; i < clear.count; i++) {
+			calibration->presence[clear.ball[i]].sized++;
+			calibration->presence[clear.ball[i]].unlike += fabsf(clear.size[i]) > unlike;
+		}
 		strays = count_strays(run, k, &places);
 		calibration->strays += strays;
 		calibration->stray_views += strays > 0;

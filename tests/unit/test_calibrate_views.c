@@ -705,6 +705,36 @@ START_TEST(balls_of_another_size_tell_how_a_phantom_stood)
 }
 END_TEST
 
+/* A helix whose code tells top from bottom is not calibrated upside down, where its shadows lie as well. */
+START_TEST(a_helix_upside_down_is_refused)
+{
+	static const char code[] = "10001000100000000101";
+	enum { COUNT = sizeof(code) - 1 };
+	bool large[COUNT];
+	const struct ball_helix helix = {
+	    .balls = COUNT, .diameter = 80, .pitch = 45, .step = 25 * M_PI / 180, .ball = {3.2, 4.8}, .large = large};
+	struct arm_scene scene = {
+	    .arm = {.columns = 200, .rows = 160, .count = 16, .pixel = 1.1, .step = 2 * M_PI / 16, .sag = 1}};
+	struct balls balls, drawing;
+	struct calibration calibration;
+	struct error err = {0};
+
+	for (int b = 0; b < COUNT; b++)
+		large[b] = code[b] == '1';
+	ck_assert(balls_helix(&drawing, &helix, &err) == 0);
+	ck_assert(balls_helix(&balls, &helix, &err) == 0);
+	for (int b = 0; b < COUNT; b++)
+		for (int a = 1; a < 3; a++)
+			balls.ball[b].centre[a] *= -1;
+	scene.target = (struct target){.balls = &balls, .ball = .5, .photons = 20000};
+	ck_assert_int_eq(arm_calibrate(&scene.arm, arm_image, &scene, &drawing, false, &calibration, &err),
+			 ERR_IMPOSSIBLE);
+	ck_assert_msg(strstr(err.text, "or stands upside down") != NULL, "%s", err.text);
+	balls_clear(&balls);
+	balls_clear(&drawing);
+}
+END_TEST
+
 /* Of balls of two sizes, all shadows wider than drawn are explained; of two that are exchanged neither is. */
 START_TEST(sizes_are_held_against_each_other)
 {
@@ -765,6 +795,7 @@ Suite *calibrate_views_suite(void)
 	tcase_add_loop_test(tests, like_circles_are_told_apart_where_the_panel_jumps, 0,
 			    sizeof(raised) / sizeof(*raised));
 	tcase_add_test(tests, a_circle_behind_a_bar_moves_no_view);
+	tcase_add_test(tests, a_helix_upside_down_is_refused);
 	tcase_add_test(tests, sizes_are_held_against_each_other);
 	tcase_add_test(tests, balls_of_another_size_tell_how_a_phantom_stood);
 	suite_add_tcase(suite, tests);
