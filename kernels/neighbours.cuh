@@ -94,13 +94,14 @@ static __device__ __forceinline__ __half2 pick(const __half2 *pairs, int i, int 
 template <neighbours KIND, int COUNT>
 static __device__ __forceinline__ void blend(const __half2 *x, float e, float t, __half2 value[(COUNT + 1) / 2])
 {
-	__half2 both = __float2half2_rn(e), first = __floats2half2_rn(t, t + e);
+	__half2 both = __float2half2_rn(e), first = __floats2half2_rn(t, t + (e + neighbours_offset(KIND, 1)));
 
 #pragma unroll
 	for (int n = 0; n < (COUNT + 1) / 2; n++) {
 		const int k = 2 * n, i = neighbours_begin(KIND, k),
 			  j = k + 1 < COUNT ? neighbours_begin(KIND, k + 1) : i + 1;
-		const float offset = neighbours_offset(KIND, k), next = neighbours_offset(KIND, k + 1);
+		const float offset = neighbours_offset(KIND, k);
+		const float next = neighbours_offset(KIND, k + 1) - neighbours_offset(KIND, 1); /* `first` has that */
 		__half2 above = offset != 0 || next != 0 ? __hadd2(first, __floats2half2_rn(offset, next)) : first;
 		__half2 here = pick(x, i + 1, j + 1), up = __hfma2_sat(both, __float2half2_rn((float)k), above);
 		__half2 down = __hfma2_sat(both, __float2half2_rn((float)-k), __hneg2(above));
