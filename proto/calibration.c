@@ -536,7 +536,7 @@ cJSON *calibration_doubts(const cJSON *json)
 		snprintf(detail, sizeof(detail),
 			 "the shadows are %.3f times as wide as those of the drawing's balls (expected within %.1f "
 			 "%%), and the "
-			 "sources stand %.3f times as far from the isocentre as the scan's geometry has them (within "
+			 "sources stand %.3f times as far from the axis as the scan's geometry has them (within "
 			 "%.1f %%): "
 			 "the drawing may have another scale than the phantom",
 			 shadows, 100 * shadows_open, sources, 100 * sources_open);

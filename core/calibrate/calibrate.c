@@ -145,12 +145,12 @@ static int adjust_balls(struct run *run, struct error *err)
 }
 
 /*
- * Distances of the sources from the isocentre over the nominal ones: their mean, and by how much views differ. What
- * each view's own noise makes of that goes out of the mean with their number.
+ * Distances of the sources from an axis over the nominal ones: their mean, and by how much views differ. What each
+ * view's own noise makes of that goes out of the mean with their number.
  */
-static void measure_distances(const struct run *run)
+static void distances_from(const struct run *run, const struct axis *axis, double *ret_ratio, double *ret_error)
 {
-	struct calibration *calibration = run->calibration;
+	const struct calibration *calibration = run->calibration;
 	double sum = 0, squares = 0, noise = 0, count = 0;
 
 	for (int k = 0; k < calibration->count; k++) {
@@ -160,8 +160,8 @@ static void measure_distances(const struct run *run)
 
 		if (!view->used)
 			continue;
-		nominal = vec_norm(run->request->nominal->views[k].source);
-		off = vec_norm(work->pose.source) / nominal - 1;
+		nominal = axis_distance(&axis_z, run->request->nominal->views[k].source);
+		off = axis_distance(axis, work->pose.source) / nominal - 1;
 		own = noise_of(view->rms, work->pair_count) / nominal *
 		      certainty_of(&work->pose, run->request->pixel_mm, &calibration->balls, work->pairs,
 				   work->pair_count)
@@ -171,9 +171,32 @@ static void measure_distances(const struct run *run)
 		noise += own * own;
 		count++;
 	}
-	calibration->distance_ratio = 1 + sum / count;
-	calibration->distance_error =
+	*ret_ratio = 1 + sum / count;
+	*ret_error =
 	    sqrt(fmax(0, (squares - sum * sum / count) / fmax(1, count - 1) - noise / count) + noise / (count * count));
+}
+
+/*
+ * From the drawing's z, and from the arm's axis, which a phantom may stand beside: over a short arc all sources are
+ * nearer to it then, or farther from it, and a sagging arm's go as if there were another axis. One of another scale is
+ * off by both; the lesser is said.
+ */
+static int measure_distances(const struct run *run, struct error *err)
+{
+	struct calibration *calibration = run->calibration;
+	double ratio, error;
+	struct axis axis;
+	int code = axis_of(calibration, run->request->nominal, &axis, err);
+
+	if (code < 0)
+		return code;
+	distances_from(run, &axis_z, &calibration->distance_ratio, &calibration->distance_error);
+	distances_from(run, &axis, &ratio, &error);
+	if (fabs(ratio - 1) < fabs(calibration->distance_ratio - 1)) {
+		calibration->distance_ratio = ratio;
+		calibration->distance_error = error;
+	}
+	return 0;
 }
 
 /* Residuals over all views, and by how much the phantom was turned and its shadows are too large. */
@@ -205,8 +228,9 @@ static int summarise(struct run *run, struct error *err)
 	calibration->rms = sqrt(squares / count);
 	calibration->rms_isocentre = sqrt(squares_isocentre / count);
 	calibration->turn = atan2(across, along);
-	measure_distances(run);
-	code = diameters_measure(run, &diameters, err);
+	code = measure_distances(run, err);
+	if (code == 0)
+		code = diameters_measure(run, &diameters, err);
 	if (code < 0)
 		return code;
 	calibration->diameter_ratio = diameters.ratio;
@@ -358,11 +382,10 @@ static int check_result(const struct run *run, double turn, struct error *err)
 		    "was given), expected within %.0f %%",
 		    ratio, ratio * run->least, run->least, 100 * DIAMETER_TOLERANCE);
 	if (fabs(scale - 1) > SCALE_TOLERANCE)
-		return error_set(
-		    err, ERR_IMPOSSIBLE,
-		    "with this phantom the sources stand %.4g times as far from the isocentre as the scan's "
-		    "geometry has them, expected within %.0f %%: one of them has another scale",
-		    scale, 100 * SCALE_TOLERANCE);
+		return error_set(err, ERR_IMPOSSIBLE,
+				 "with this phantom the sources stand %.4g times as far from the axis as the scan's "
+				 "geometry has them, expected within %.0f %%: one of them has another scale",
+				 scale, 100 * SCALE_TOLERANCE);
 	return 0;
 }
 

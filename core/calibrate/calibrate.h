@@ -125,7 +125,8 @@ struct calibration {
 	double diameter_ratio; /* median of shadow's to expected diameter */
 	double diameter_error; /* of this ratio: what noise and blur leave open */
 	double explained;      /* mm at the isocentre, of rms_isocentre, that noise and centring may make up */
-	double distance_ratio; /* of the sources' mean distance from the isocentre to the nominal one */
+	double distance_ratio; /* of the sources' mean distance to the nominal one, from z or the arm's axis: nearer to
+				  1 */
 	/*
 	 * Of this ratio: the standard deviation of the views' own, of which noise goes out of the mean with their
 	 * number. An arm that sags, and a phantom beside the axis, which over a short sweep has most sources on its one

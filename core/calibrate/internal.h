@@ -253,6 +253,7 @@ struct axis {
 	double frame[3][3]; /* its x, y and z, unit vectors, the last along it */
 	double at[2];       /* mm along these x and y, where it stands */
 };
+extern const struct axis axis_z; /* the drawing's */
 void pose_turn_about(struct pose *pose, const struct axis *axis, double angle);
 /* A view's source, in the order of the sweep. */
 struct source {
@@ -263,6 +264,11 @@ struct source {
  * turn from a view to the next by their nominal angle: the arm sags, and views may stand elsewhere about the phantom.
  */
 int arm_axis(const struct source *sources, int count, struct axis *ret_axis, struct error *err);
+/* That of the views that are used. */
+int axis_of(const struct calibration *calibration, const struct geometry *nominal, struct axis *ret_axis,
+	    struct error *err);
+/* mm, across it. */
+double axis_distance(const struct axis *axis, const double place[3]);
 /*
  * Refuses views that do not follow their neighbours: from the shift of the balls' shadows against the nominal
  * geometry, which is smooth over a sweep.

@@ -98,6 +98,8 @@ static struct pose blend(const struct pose *a, const struct pose *b, double shar
 	return pose;
 }
 
+const struct axis axis_z = {.frame = {{1, 0, 0}, {0, 1, 0}, {0, 0, 1}}};
+
 /* A vector in the axis' frame, or back from there. */
 static void to_frame(const struct axis *axis, bool back, double v[3])
 {
@@ -193,7 +195,7 @@ int arm_axis(const struct source *sources, int count, struct axis *ret_axis, str
 	for (int a = 0; a < 2; a++)
 		ret_axis->at[a] = found > 0 ? select_kth(points + a * count, found, found / 2) : 0;
 	if (hypot(ret_axis->at[0], ret_axis->at[1]) < BESIDE_LEAST && ret_axis->frame[2][2] > cos(LEAN_LEAST))
-		*ret_axis = (struct axis){.frame = {{1, 0, 0}, {0, 1, 0}, {0, 0, 1}}};
+		*ret_axis = axis_z;
 	free(points);
 	return 0;
 }
@@ -301,6 +303,25 @@ int calibration_between(struct geometry *ret_geometry, const struct geometry *no
 	free(stations);
 	free(found);
 	return code;
+}
+
+int axis_of(const struct calibration *calibration, const struct geometry *nominal, struct axis *ret_axis,
+	    struct error *err)
+{
+	struct station *stations = stations_of(nominal);
+	int code = stations != NULL ? find_axis(stations, calibration->count, calibration, NULL, ret_axis, err)
+				    : error_set(err, ERR_NO_MEMORY, "no memory for %d views", calibration->count);
+
+	free(stations);
+	return code;
+}
+
+double axis_distance(const struct axis *axis, const double place[3])
+{
+	double own[3] = {place[0], place[1], place[2]};
+
+	to_frame(axis, false, own);
+	return hypot(own[0] - axis->at[0], own[1] - axis->at[1]);
 }
 
 /* A calibration's views in their order. */

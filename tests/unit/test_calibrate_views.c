@@ -415,6 +415,37 @@ START_TEST(a_phantom_may_stand_beside_the_axis_and_lean)
 END_TEST
 
 /*
+ * Over a short arc the sources are all nearer to a phantom that stands beside the axis, or farther from it: that tells
+ * nothing of its scale.
+ */
+START_TEST(a_phantom_beside_the_axis_of_a_short_arc_has_its_scale)
+{
+	static const double shift[3] = {-40, 0, 0};
+	struct arm_scene scene = {.arm = arm_coarse};
+	struct balls balls, drawing;
+	struct calibration calibration;
+	struct error err = {0};
+
+	ck_assert(balls_circles(&drawing, &circles, &err) == 0);
+	ck_assert(balls_circles(&balls, &circles, &err) == 0);
+	for (int b = 0; b < balls.count; b++)
+		tilt_and_shift(&balls.ball[b], 0, shift);
+	scene.arm.count = 16;
+	scene.arm.first = -75 * M_PI / 180;
+	scene.arm.step = 10 * M_PI / 180;
+	scene.target = (struct target){.balls = &balls, .ball = .4, .photons = 20000};
+	ck_assert_msg(arm_calibrate(&scene.arm, arm_image, &scene, &drawing, false, &calibration, &err) == 0, "%s",
+		      err.text);
+	ck_assert_int_eq(calibration.used, calibration.count);
+	ck_assert_msg(fabs(calibration.distance_ratio - 1) < .01, "%.4f within %.4f", calibration.distance_ratio,
+		      calibration.distance_error);
+	calibration_clear(&calibration);
+	balls_clear(&balls);
+	balls_clear(&drawing);
+}
+END_TEST
+
+/*
  * Like circles one above the other, of which those at an end are partly or wholly beside the picture: those that a view
  * shows could be the next ones as well. What all views show tells, or that it is not known is told.
  */
@@ -789,6 +820,7 @@ Suite *calibrate_views_suite(void)
 	tcase_add_loop_test(tests, views_of_a_flat_phantom_begin_from_their_neighbours, 0,
 			    sizeof(flat) / sizeof(*flat));
 	tcase_add_test(tests, a_phantom_may_stand_beside_the_axis_and_lean);
+	tcase_add_test(tests, a_phantom_beside_the_axis_of_a_short_arc_has_its_scale);
 	tcase_add_test(tests, a_pose_is_found_down_a_long_valley);
 	tcase_add_test(tests, a_phantom_of_many_balls_is_found_turned_as_it_stood);
 	tcase_add_loop_test(tests, of_like_circles_each_is_taken_for_itself, 0, sizeof(heights) / sizeof(*heights));
