@@ -233,6 +233,8 @@ struct station {
 	double angle; /* radians, -pi to pi, of its nominal source */
 	int view;
 };
+/* Radians from a direction on to another, 0 to 2 pi. */
+double onward(double from, double to);
 /* All views in that order, the caller's to free; NULL: no memory. */
 struct station *stations_of(const struct geometry *nominal);
 /*

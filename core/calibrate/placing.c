@@ -74,14 +74,6 @@ static struct pose moved(const struct stance *stance, const struct motion *furth
 	return pose;
 }
 
-/* Radians from a view on to a later one. */
-static double onward(const struct stance *last, const struct stance *next)
-{
-	const double angle = fmod(next->angle - last->angle, 2 * M_PI);
-
-	return angle < 0 ? angle + 2 * M_PI : angle;
-}
-
 /* A view's pose once the arm stands at another's angle. */
 static struct pose onwards(const struct placing *placing, const struct stance *stance, double angle)
 {
@@ -114,12 +106,12 @@ static struct motion nearest(const struct placing *placing, const struct stance 
 	double far[2][2] = {{INFINITY, INFINITY}, {INFINITY, INFINITY}}, way[2] = {0};
 	int best[2] = {0}, nearer;
 
-	if (before != NULL && onward(before, last) > 0) {
+	if (before != NULL && onward(before->angle, last->angle) > 0) {
 		const struct pose from = onwards(placing, before, last->angle);
 
 		apart(placing, last, &motions->motion[0], &from, way);
 		for (int e = 0; e < 2; e++)
-			way[e] *= onward(last, next) / onward(before, last);
+			way[e] *= onward(last->angle, next->angle) / onward(before->angle, last->angle);
 	}
 	for (int m = 0; m < motions->count; m++) {
 		double mean[2], square = pow(apart(placing, next, &motions->motion[m], &expected, mean), 2);
@@ -159,7 +151,7 @@ static double off_chain(const struct placing *placing, const struct chain *chain
 
 	*ret_motion = nearest(placing, before, last, next, far);
 	return FARTHER * far[0] <= far[1] &&
-		       far[0] <= fmax(least, LEAP * placing->pace[before != NULL] * onward(last, next))
+		       far[0] <= fmax(least, LEAP * placing->pace[before != NULL] * onward(last->angle, next->angle))
 		   ? far[0]
 		   : INFINITY;
 }
@@ -407,11 +399,11 @@ static int find_pace(struct placing *placing, struct error *err)
 	for (int i = 1; i < placing->count && code == 0; i++) {
 		struct stance *next = &placing->stances[i];
 
-		for (int k = i > 1; k >= 0 && onward(next - 1, next) > 0; k--) {
+		for (int k = i > 1; k >= 0 && onward(next[-1].angle, next->angle) > 0; k--) {
 			double far[2];
 			const struct motion motion = nearest(placing, k > 0 ? next - 2 : NULL, next - 1, next, far);
 
-			paces[k][count[k]++] = (float)(far[0] / onward(next - 1, next));
+			paces[k][count[k]++] = (float)(far[0] / onward(next[-1].angle, next->angle));
 			next->motion = k == 0 ? motion : next->motion;
 		}
 	}

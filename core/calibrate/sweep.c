@@ -40,8 +40,7 @@ struct station *stations_of(const struct geometry *nominal)
 	return stations;
 }
 
-/* Angle from one direction on to another, 0 to 2 pi. */
-static double onward(double from, double to)
+double onward(double from, double to)
 {
 	const double angle = fmod(to - from, 2 * M_PI);
 
