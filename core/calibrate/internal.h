@@ -264,6 +264,7 @@ struct source {
 /*
  * The axis goes along the median normal of three sources each, through the median of the points about which sources
  * turn from a view to the next by their nominal angle: the arm sags, and views may stand elsewhere about the phantom.
+ * Where such normals have no median direction, along z.
  */
 int arm_axis(const struct source *sources, int count, struct axis *ret_axis, struct error *err);
 /* That of the views that are used. */

@@ -157,9 +157,10 @@ static void lean_of(const struct source *sources, int count, float *scratch, dou
 	}
 	for (int a = 0; a < 3; a++)
 		z[a] = third > 0 ? select_kth(scratch + a * third, third, third / 2) : a == 2;
+	/* Of normals that go all ways, as of sources that lie about no axis, the medians have no direction. */
 	size = vec_norm(z);
 	for (int a = 0; a < 3; a++)
-		z[a] /= size;
+		z[a] = size > 0 ? z[a] / size : a == 2;
 	vec_cross(z, x, ret_frame[1]);
 	size = vec_norm(ret_frame[1]);
 	for (int a = 0; a < 3; a++)

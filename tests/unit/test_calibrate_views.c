@@ -389,6 +389,27 @@ START_TEST(views_of_a_flat_phantom_begin_from_their_neighbours)
 }
 END_TEST
 
+/* The normals of three sources each are x, -x and y, whose median is no direction. */
+START_TEST(sources_about_no_axis_have_that_of_the_drawing)
+{
+	static const double places[][3] = {{0, 0, 0},   {0, 0, 0},   {0, 0, 0},    {0, 600, 0}, {0, 600, 0},
+					   {0, 0, 600}, {0, 0, 600}, {0, 0, -600}, {600, 0, 0}};
+	struct source sources[9];
+	struct axis axis;
+	struct error err;
+
+	for (int i = 0; i < 9; i++) {
+		sources[i] = (struct source){.angle = .5 * i};
+		memcpy(sources[i].place, places[i], sizeof(sources[i].place));
+	}
+	ck_assert_int_eq(arm_axis(sources, 9, &axis, &err), 0);
+	for (int i = 0; i < 3; i++)
+		for (int a = 0; a < 3; a++)
+			ck_assert_double_eq(axis.frame[i][a], i == a);
+	ck_assert(isfinite(axis.at[0]) && isfinite(axis.at[1]));
+}
+END_TEST
+
 /* A phantom that stands beside the axis and leans: its neighbours turn about the arm's axis, not about the drawing's.
  */
 START_TEST(a_phantom_may_stand_beside_the_axis_and_lean)
@@ -819,6 +840,7 @@ Suite *calibrate_views_suite(void)
 	tcase_add_loop_test(tests, a_ball_more_or_less_is_told, 0, sizeof(presences) / sizeof(*presences));
 	tcase_add_loop_test(tests, views_of_a_flat_phantom_begin_from_their_neighbours, 0,
 			    sizeof(flat) / sizeof(*flat));
+	tcase_add_test(tests, sources_about_no_axis_have_that_of_the_drawing);
 	tcase_add_test(tests, a_phantom_may_stand_beside_the_axis_and_lean);
 	tcase_add_test(tests, a_phantom_beside_the_axis_of_a_short_arc_has_its_scale);
 	tcase_add_test(tests, a_pose_is_found_down_a_long_valley);
