@@ -1297,8 +1297,25 @@ static void check_metal(struct device *devices[2], enum bend bend, bool referenc
 	scene_clear(&scene);
 }
 
+/* Makes counts of line integrals, of a flat image that is uneven, and says how lag and scatter are taken off them. */
+static struct linearise count(float *samples, int views, size_t pixels, float *ret_flat)
+{
+	static const struct lag_model lag = {2, {{.02, 1.2}, {.01, 20}}};
+	static const struct scatter_model kernel = {.count = 1, .kernels = {{.35, .1, 1.8, 60, .27}}};
+
+	for (size_t i = 0; i < pixels; i++)
+		ret_flat[i] = 40000 + 100 * (float)(i % 97);
+	for (size_t i = 0; i < pixels * (size_t)views; i++)
+		samples[i] = ret_flat[i % pixels] * (expf(-samples[i]) + .05f);
+	return (struct linearise){.sample = SAMPLE_FLOAT32,
+				  .quantity = QUANTITY_INTENSITY,
+				  .image[IMAGE_FLAT] = ret_flat,
+				  .lag = &lag,
+				  .scatter = &kernel};
+}
+
 /* A device that is too small for the job has it out of core: what the whole gives, and the same bits again. */
-static void check_parts(bool tv, bool untilted, bool matched)
+static void check_parts(bool tv, bool untilted, bool matched, bool counts)
 {
 	const struct scene_options at = {.columns = 257,
 					 .rows = 193,
@@ -1309,6 +1326,7 @@ static void check_parts(bool tv, bool untilted, bool matched)
 					 .spacing = {.6, .6, .6},
 					 .bend = untilted ? BEND_NONE : BEND_TILTED};
 	const struct recon_hooks hooks = {0};
+	struct linearise linearise = line_integrals;
 	struct recon_memory memory;
 	struct phantom head;
 	struct recipe recipe;
@@ -1316,13 +1334,23 @@ static void check_parts(bool tv, bool untilted, bool matched)
 	struct error err = {0};
 	size_t pixels = (size_t)at.columns * (size_t)at.rows, voxels;
 	float *raw = malloc(pixels * (size_t)at.views * sizeof(float)), *got[3];
+	float *flat = malloc(pixels * sizeof(float));
 	int *views = all_views(at.views);
 
-	scene_make(&scene, matched ? "out of core, matched" : tv ? "out of core, TV" : "out of core", &at);
+	scene_make(&scene,
+		   counts    ? "out of core, counts"
+		   : matched ? "out of core, matched"
+		   : tv      ? "out of core, TV"
+			     : "out of core",
+		   &at);
 	voxels = grid_voxels(&scene.grid);
 	must(phantom_named(&head, "head", 42, .0192, &err), &err, "head");
-	for (int i = 0; i < at.views; i++)
+	for (int i = 0; i < at.views; i++) {
+		views[i] = counts ? i : views[i]; /* lag is of their order */
 		phantom_project(&head, &scene.geometry, views[i], raw + pixels * (size_t)i);
+	}
+	if (counts)
+		linearise = count(raw, at.views, pixels, flat);
 	recipe_defaults(&recipe);
 	recipe.has_grid = recipe.has_origin = true;
 	recipe.grid = scene.grid;
@@ -1334,8 +1362,7 @@ static void check_parts(bool tv, bool untilted, bool matched)
 	recipe.tv.on = tv;
 	recipe_explicit_tv(&recipe, TV_GRADIENT);
 	recipe.reference_precision = true;
-	must(recon_memory(&backend_cuda, NULL, &scene.geometry, &line_integrals, &recipe, &memory, &err), &err,
-	     "memory");
+	must(recon_memory(&backend_cuda, NULL, &scene.geometry, &linearise, &recipe, &memory, &err), &err, "memory");
 	for (int s = 0; s < 3; s++) {
 		const struct device_options limit = {.memory_limit =
 							 s == 0 ? 0 : memory.total / (tv || matched ? 4 : 2)};
@@ -1344,7 +1371,7 @@ static void check_parts(bool tv, bool untilted, bool matched)
 
 		got[s] = malloc(voxels * sizeof(float));
 		must(backend_cuda.open(0, &limit, &device, &err), &err, "open");
-		must(recon_open(&backend_cuda, device, &scene.geometry, &line_integrals, &recipe, &hooks, &recon, &err),
+		must(recon_open(&backend_cuda, device, &scene.geometry, &linearise, &recipe, &hooks, &recon, &err),
 		     &err, "open out of core");
 		must(recon_push(recon, raw, views, at.views, &err), &err, "push");
 		must(recon_run(recon, &err), &err, "run");
@@ -1363,6 +1390,7 @@ static void check_parts(bool tv, bool untilted, bool matched)
 	for (int s = 0; s < 3; s++)
 		free(got[s]);
 	free(raw);
+	free(flat);
 	free(views);
 	recipe_clear(&recipe);
 	phantom_clear(&head);
@@ -1866,10 +1894,11 @@ int main(int argc, char **argv)
 	check_thrift(4, false, false, 4);
 	check_bound();
 	check_said(devices[1]);
-	check_parts(false, true, false);
-	check_parts(false, false, false);
-	check_parts(true, false, false);
-	check_parts(false, false, true);
+	check_parts(false, true, false, false);
+	check_parts(false, false, false, false);
+	check_parts(true, false, false, false);
+	check_parts(false, false, true, false);
+	check_parts(false, true, false, true);
 	backend_cuda.describe(devices[1], &after);
 	if (before.bytes_free - after.bytes_free > (size_t)64 << 20 && after.bytes_free < before.bytes_free) {
 		printf("FAILED  %.1f MiB of device memory did not come back\n",
