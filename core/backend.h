@@ -101,8 +101,8 @@ struct plan_options {
 	struct linearise linearise;
 	/* FDK, or NULL when none runs: orbit_column_weights and filter_response (pitch 1, length filter_length of the
 	 * padded columns). */
-	const float *column_weights; /* [count][columns] */
-	double axis[3];              /* of the rotation, a unit vector; all 0: z. The cosine is against the way to it */
+	const float *column_weights;  /* [count][columns] */
+	struct rotation_axis axis;    /* of the rotation; the cosine is against the way to it */
 	const float *filter_response; /* [length/2 + 1] */
 	/*
 	 * Filtered rows reach pad[0] columns before column 0 and pad[1] after the

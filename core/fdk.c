@@ -29,8 +29,9 @@ int fdk_weights_make(struct fdk_weights *ret_weights, const struct orbit *orbit,
 	    .extended = extend ? malloc(sizeof(float) * ((size_t)longer / 2 + 1)) : NULL,
 	};
 
+	memcpy(weights.axis.at, orbit->centre, sizeof(weights.axis.at));
 	if (orbit->lean > 0)
-		memcpy(weights.axis, orbit->frame[2], sizeof(weights.axis));
+		memcpy(weights.axis.along, orbit->frame[2], sizeof(weights.axis.along));
 	if (weights.columns == NULL || weights.response == NULL || (extend && weights.extended == NULL)) {
 		code = error_set(err, ERR_NO_MEMORY, "no memory for the FDK weights of %d views", geometry->count);
 		goto out;

@@ -7,12 +7,12 @@
 
 /* Weights and responses that the backend's `filter` needs beside the projections. */
 struct fdk_weights {
-	float *columns;  /* [view][column], owned */
-	float *response; /* [length/2 + 1], owned */
-	int pad[2];      /* orbit.pad */
-	double axis[3];  /* plan_options.axis */
-	int extend;      /* plan_options.extend */
-	float *extended; /* its response, owned; NULL without */
+	float *columns;            /* [view][column], owned */
+	float *response;           /* [length/2 + 1], owned */
+	int pad[2];                /* orbit.pad */
+	struct rotation_axis axis; /* plan_options.axis */
+	int extend;                /* plan_options.extend */
+	float *extended;           /* its response, owned; NULL without */
 };
 
 /* Free with fdk_weights_clear. */

@@ -728,7 +728,7 @@ static struct device_view view_make(const struct plan_options *options, int inde
 		result.matrix[r][3] = (float)(offset / depth);
 	}
 	result.shadow = shadow_of(geometry, grid, index);
-	axis_direction(view->source, options->axis, central);
+	axis_direction(view->source, &options->axis, central);
 	for (int i = 0; i < 3; i++)
 		result.central[i] = (float)central[i];
 	return result;

@@ -159,12 +159,12 @@ static struct plan_options plan_options_of(const struct exterior_volume_options 
 	    .pad = {options->orbit->pad[0], options->orbit->pad[1]},
 	    .extend = weights->extend,
 	    .extended_response = weights->extended,
+	    .axis = weights->axis,
 	    .resident = 1, /* what is filtered in one go takes the most room, and the volume is small */
 	    .lender = options->plan,
 	    .no_samples = true,
 	};
 
-	memcpy(plan.axis, weights->axis, sizeof(plan.axis));
 	return plan;
 }
 

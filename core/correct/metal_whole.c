@@ -65,12 +65,11 @@ static struct plan_options plan_options_of(const struct geometry *geometry, cons
 	    .pad = {weights->pad[0], weights->pad[1]},
 	    .extend = weights->extend,
 	    .extended_response = weights->extended,
+	    .axis = weights->axis,
 	    .reference_precision = recipe->reference_precision,
 	    .no_samples = true,
 	};
 
-	for (int a = 0; a < 3; a++)
-		plan.axis[a] = weights->axis[a];
 	return plan;
 }
 

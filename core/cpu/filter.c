@@ -25,7 +25,7 @@ struct transform {
 struct filter_engine {
 	const struct geometry *geometry; /* borrowed, as are the weights */
 	const float *column_weights;     /* [view][column] */
-	double axis[3];                  /* plan_options.axis */
+	struct rotation_axis axis;       /* plan_options.axis */
 	int pad, wide;                   /* zero columns before column 0; columns of a filtered row */
 	int extend;                      /* columns that truncated rows get on either side */
 	bool sides[2];                   /* that may be extended */
@@ -85,7 +85,7 @@ struct filter_engine *filter_engine_walk(const struct plan_options *options, int
 	*engine = (struct filter_engine){
 	    .geometry = options->geometry,
 	    .column_weights = options->column_weights,
-	    .axis = {options->axis[0], options->axis[1], options->axis[2]},
+	    .axis = options->axis,
 	    .pad = options->pad[0],
 	    .wide = wide,
 	    .extend = options->extend,
@@ -269,7 +269,7 @@ static void write_extension(const struct filter_engine *engine, int view, const 
 	const float weight = engine->column_weights[(size_t)view * (size_t)rows->columns + (size_t)outermost];
 	double direction[3];
 
-	axis_direction(engine->geometry->views[view].source, engine->axis, direction);
+	axis_direction(engine->geometry->views[view].source, &engine->axis, direction);
 	for (int x = 1; x <= engine->extend; x++) {
 		const int column = side == 0 ? -x : outermost + x;
 		const int at = engine->pad + column + (column < 0 ? engine->extended.length : 0);
@@ -292,7 +292,7 @@ static void weight_rows(const struct filter_engine *engine, int view, const stru
 	const struct view *from = &engine->geometry->views[view];
 	double direction[3];
 
-	axis_direction(from->source, engine->axis, direction);
+	axis_direction(from->source, &engine->axis, direction);
 	for (int c = 0; c < rows->columns; c++) {
 		float weights[ROWS], values[ROWS] = {0};
 

@@ -42,6 +42,7 @@ struct plan_options plan_options(const struct recon *recon)
 	    .pad = {weights->pad[0], weights->pad[1]},
 	    .extend = weights->extend,
 	    .extended_response = weights->extended,
+	    .axis = weights->axis,
 	    .sart = has_subsets(recipe) ? &recon->sart : NULL,
 	    .matched = recipe->algorithm != NULL && recipe->projector == PROJECTOR_MATCHED,
 	    .tv = recipe->tv.on ? &recipe->tv.options : NULL,
@@ -50,7 +51,6 @@ struct plan_options plan_options(const struct recon *recon)
 	    .resident = keeps_projections(recipe) ? 0 : fdk_batch_most(geometry->count),
 	};
 
-	memcpy(options.axis, recon->weights.axis, sizeof(options.axis));
 	return options;
 }
 

@@ -68,10 +68,10 @@ static struct plan_options plan_options_of(const struct half *half)
 	    .pad = {half->weights.pad[0], half->weights.pad[1]},
 	    .extend = half->weights.extend,
 	    .extended_response = half->weights.extended,
+	    .axis = half->weights.axis,
 	    .no_samples = true,
 	};
 
-	memcpy(options.axis, half->weights.axis, sizeof(options.axis));
 	return options;
 }
 

@@ -392,19 +392,21 @@ double view_axis_distance(const double matrix[12], double column, double row)
 	return fabs((column - at[0][0]) * along[1] - (row - at[0][1]) * along[0]) / hypot(along[0], along[1]);
 }
 
-void axis_direction(const double source[3], const double axis[3], double ret_direction[3])
+void axis_direction(const double source[3], const struct rotation_axis *axis, double ret_direction[3])
 {
 	static const double z[3] = {0, 0, 1};
-	const double *way = vec_dot(axis, axis) > 0 ? axis : z;
-	double length;
+	const double *way = vec_dot(axis->along, axis->along) > 0 ? axis->along : z;
+	double from[3], length;
 
 	for (int i = 0; i < 3; i++)
-		ret_direction[i] = vec_dot(source, way) * way[i] - source[i];
+		from[i] = source[i] - axis->at[i];
+	for (int i = 0; i < 3; i++)
+		ret_direction[i] = vec_dot(from, way) * way[i] - from[i];
 	length = vec_norm(ret_direction);
 	if (!(length > 0)) {
-		length = vec_norm(source);
+		length = vec_norm(from);
 		for (int i = 0; i < 3; i++)
-			ret_direction[i] = -source[i];
+			ret_direction[i] = -from[i];
 	}
 	for (int i = 0; i < 3; i++)
 		ret_direction[i] = length > 0 ? ret_direction[i] / length : 0;

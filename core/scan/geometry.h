@@ -88,12 +88,13 @@ double view_project(const double matrix[12], const double point[3], double *ret_
  */
 double view_axis_distance(const double matrix[12], double column, double row);
 
-/*
- * Unit vector from a source straight across to the rotation axis, which goes
- * through the isocentre along the unit vector `axis`, z where that is all 0; from
- * on the axis to the isocentre, from the isocentre 0.
- */
-void axis_direction(const double source[3], const double axis[3], double ret_direction[3]);
+/* A rotation axis: a place on it, mm, and its unit vector, z where that is all 0. All 0: z through the origin. */
+struct rotation_axis {
+	double at[3], along[3];
+};
+
+/* Unit vector from a source straight across to the axis; from on the axis to its place, and from there 0. */
+void axis_direction(const double source[3], const struct rotation_axis *axis, double ret_direction[3]);
 
 /*
  * True when every detector row is across z and every column along z, the

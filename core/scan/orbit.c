@@ -28,10 +28,16 @@ static const double DISPLACED_PIXELS = 0.5, DISPLACED_WIDTH = 0.02;
 
 struct view orbit_view(const struct orbit *orbit, const struct view *view)
 {
-	const double *const from[] = {view->source, view->pixel0, view->column_step, view->row_step};
-	struct view ret = *view;
+	struct view from_centre = *view, ret;
+	const double *const from[] = {from_centre.source, from_centre.pixel0, from_centre.column_step,
+				      from_centre.row_step};
 	double *const to[] = {ret.source, ret.pixel0, ret.column_step, ret.row_step};
 
+	for (int i = 0; i < 3; i++) {
+		from_centre.source[i] -= orbit->centre[i];
+		from_centre.pixel0[i] -= orbit->centre[i];
+	}
+	ret = from_centre;
 	if (orbit->lean > 0)
 		for (int k = 0; k < 4; k++)
 			for (int i = 0; i < 3; i++)
@@ -346,52 +352,70 @@ static int find_padding(const struct orbit *orbit, const struct geometry *geomet
 	return (int)fmin(ceil(most - 1e-6), 2 * geometry->columns);
 }
 
+/* Room for views in the order of their angles. */
+struct order {
+	struct placed *placed;
+	struct station *station;
+};
+
+/* Sets all that is about the orbit's centre, which is known; its frame and the geometry's sides are, too. */
+static void describe(struct orbit *orbit, const struct geometry *geometry, const struct order *order)
+{
+	double width = 0;
+	bool aside;
+
+	orbit->source_radius = orbit->source_to_detector = orbit->displacement = 0;
+	orbit->half_fan_min = orbit->half_fan_max = orbit->holes = 0;
+	memset(orbit->pixel_at_isocentre, 0, sizeof(orbit->pixel_at_isocentre));
+	for (int k = 0; k < geometry->count; k++) {
+		const struct view view = orbit_view(orbit, &geometry->views[k]);
+
+		orbit->angle[k] = wrap(atan2(view.source[1], view.source[0]));
+		order->placed[k] = (struct placed){.angle = orbit->angle[k], .view = k};
+		width += vec_norm(view.column_step) / geometry->count;
+	}
+	qsort(order->placed, (size_t)geometry->count, sizeof(*order->placed), by_angle);
+	take_means(orbit, geometry);
+	aside = fabs(orbit->displacement) > DISPLACED_PIXELS * width &&
+		fabs(orbit->displacement) > DISPLACED_WIDTH * width * geometry->columns;
+	follow(orbit, order->placed, order->station, find_stations(order->placed, geometry->count, order->station),
+	       aside);
+	orbit->displaced = aside && !orbit->short_scan;
+	find_fan(orbit, geometry);
+	orbit->field_of_view = orbit_field_of_view(orbit, geometry);
+}
+
 int orbit_analyse(struct orbit *ret_orbit, const struct geometry *given, struct error *err)
 {
 	size_t count = (size_t)given->count;
 	struct orbit orbit = {.count = given->count};
-	struct geometry sides = *given;
-	const struct geometry *geometry = &sides;
-	struct placed *placed = malloc(count * sizeof(*placed));
-	struct station *station = calloc(count, sizeof(*station));
-	double width = 0, tilts[2];
-	bool aside;
+	struct geometry geometry = *given;
+	struct order order = {malloc(count * sizeof(*order.placed)), calloc(count, sizeof(*order.station))};
+	double tilts[2];
 	int code = 0;
 
 	orbit.angle = calloc(count, sizeof(*orbit.angle));
 	orbit.weight = calloc(count, sizeof(*orbit.weight));
-	if (placed == NULL || station == NULL || orbit.angle == NULL || orbit.weight == NULL) {
-		code = error_set(err, ERR_NO_MEMORY, "no memory for %d views", geometry->count);
+	if (order.placed == NULL || order.station == NULL || orbit.angle == NULL || orbit.weight == NULL) {
+		code = error_set(err, ERR_NO_MEMORY, "no memory for %d views", given->count);
 		goto out;
 	}
-	find_frame(&orbit, geometry);
-	find_tilts(&orbit, geometry, tilts);
+	find_frame(&orbit, given);
+	find_tilts(&orbit, given, tilts);
 	orbit.turned = tilts[0] > 0.25 * M_PI && tilts[0] > tilts[1];
 	orbit.tilt = tilts[orbit.turned];
-	sides = orbit_sides(&orbit, given);
-	for (int k = 0; k < geometry->count; k++) {
-		const struct view turned = orbit_view(&orbit, &geometry->views[k]), *view = &turned;
-
-		orbit.angle[k] = wrap(atan2(view->source[1], view->source[0]));
-		placed[k] = (struct placed){.angle = orbit.angle[k], .view = k};
-		width += vec_norm(view->column_step) / geometry->count;
-	}
-	qsort(placed, count, sizeof(*placed), by_angle);
-	take_means(&orbit, geometry);
-	aside = fabs(orbit.displacement) > DISPLACED_PIXELS * width &&
-		fabs(orbit.displacement) > DISPLACED_WIDTH * width * geometry->columns;
-	follow(&orbit, placed, station, find_stations(placed, geometry->count, station), aside);
-	orbit.displaced = aside && !orbit.short_scan;
-	find_fan(&orbit, geometry);
-	orbit_find_centre(&orbit, geometry);
+	geometry = orbit_sides(&orbit, given);
+	describe(&orbit, &geometry, &order);
+	if (orbit_find_centre(&orbit, &geometry))
+		describe(&orbit, &geometry, &order);
 	if (orbit.displaced)
-		orbit.pad[orbit.displacement > 0 ? 0 : 1] = find_padding(&orbit, geometry);
+		orbit.pad[orbit.displacement > 0 ? 0 : 1] = find_padding(&orbit, &geometry);
 	orbit.parker_delta = 0.5 * (orbit.arc - M_PI);
 	orbit.arc_too_short = orbit.short_scan && orbit.arc - orbit.holes < M_PI + orbit.fan - SAME_ANGLE;
 	*ret_orbit = orbit;
 out:
-	free(placed);
-	free(station);
+	free(order.placed);
+	free(order.station);
 	if (code < 0)
 		orbit_clear(&orbit);
 	return code;
@@ -430,9 +454,9 @@ static double half_fan(double alpha, double theta)
 	return alpha > 0 ? 2 : 0;
 }
 
-/* The fan angle up to which a displaced detector sees both sides of the axis in every view. */
-static double overlap(const struct orbit *orbit, const struct geometry *geometry, double sense)
+double orbit_overlap(const struct orbit *orbit, const struct geometry *geometry)
 {
+	const double sense = orbit->direction < 0 ? -1 : 1;
 	bool wide_high = orbit->half_fan_max > -orbit->half_fan_min;
 	double theta = INFINITY;
 
@@ -452,19 +476,24 @@ static double overlap(const struct orbit *orbit, const struct geometry *geometry
  * horizontal, l mm long from the source to the detector's plane,
  * D = R sqrt(1 - (c u)^2) and d = l sqrt(1 - (c u)^2). So a turn of the detector
  * about its row does not change it, as it does not change the middle row's rays.
+ * Backprojection multiplies by the square of the depth of the world's origin, which is
+ * taken out for that of the centre.
  */
-static double view_weight(const struct view *view)
+static double view_weight(const struct orbit *orbit, const struct view *given)
 {
+	const struct view turned = orbit_view(orbit, given), *view = &turned;
 	double matrix[12], to_detector[3], radius = hypot(view->source[0], view->source[1]);
 	double pitch = vec_norm(view->column_step);
 	double central[3] = {-view->source[0] / radius, -view->source[1] / radius, 0};
-	double along = vec_dot(central, view->column_step) / pitch, length;
+	double along = vec_dot(central, view->column_step) / pitch, length, depth;
 
 	view_matrix(view, matrix);
 	for (int i = 0; i < 3; i++)
 		to_detector[i] = view->pixel0[i] - view->source[i];
 	length = vec_dot(matrix + 8, to_detector) / vec_dot(matrix + 8, central);
-	return length / (pitch * radius * sqrt(1 - along * along));
+	depth = matrix[11];
+	view_matrix(given, matrix);
+	return pow(depth / matrix[11], 2) * length / (pitch * radius * sqrt(1 - along * along));
 }
 
 /* The view's b, 0 .. arc on a short scan. */
@@ -514,14 +543,15 @@ void orbit_column_weights(const struct orbit *orbit, const struct geometry *geom
 {
 	double sense = orbit->direction < 0 ? -1 : 1;
 	double wide = orbit->half_fan_max > -orbit->half_fan_min ? 1 : -1;
-	double theta = orbit->displaced ? overlap(orbit, geometry, sense) : 0;
+	double theta = orbit->displaced ? orbit_overlap(orbit, geometry) : 0;
 
 	assert(!orbit->turned);
 #pragma omp parallel for schedule(static)
 	for (int k = 0; k < geometry->count; k++) {
 		const struct view turned = orbit_view(orbit, &geometry->views[k]), *view = &turned;
 		float *weights = ret_weights + (size_t)k * (size_t)geometry->columns;
-		double b = place_in_arc(orbit, k), constant = 0.5 * orbit->weight[k] * view_weight(view);
+		double b = place_in_arc(orbit, k),
+		       constant = 0.5 * orbit->weight[k] * view_weight(orbit, &geometry->views[k]);
 
 		for (int column = 0; column < geometry->columns; column++) {
 			double alpha = sense * orbit_ray_angle(geometry, view, column), weight = 1;

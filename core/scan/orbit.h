@@ -51,10 +51,11 @@ struct orbit {
 	double source_radius;      /* mm, mean distance of the sources from the axis */
 	double source_to_detector; /* mm, mean, along the normal */
 	/*
-	 * mm, in the world: about it, along the frame's z, are the field of view, what is sought outside of a grid, and
-	 * the grids below. It is the origin; but where the sources' circle has its middle beside that and has surely
-	 * the wider field of view there (a real arm's is some mm beside it), that middle; and where the rows do not
-	 * reach the origin's height, their middle's. Angles and FDK's weights are about the origin in any case.
+	 * mm, in the world: about it, along the frame's z, are angles and FDK's weights, the field of view, what is
+	 * sought outside of a grid, and the grids below. It is the origin; but where the sources' circle has its middle
+	 * beside that and has surely the wider field of view there (a real arm's is some mm beside it), or a displaced
+	 * detector sees hardly any of both sides of the origin, that middle; and where the rows do not reach the
+	 * origin's height, their middle's.
 	 */
 	double centre[3];
 	double field_of_view; /* mm, diameter of the cylinder that all views see, or one half when displaced */
@@ -133,21 +134,25 @@ bool orbit_fdk_is_sound(const struct orbit *orbit);
 double orbit_axis_weight(const struct orbit *orbit, int view);
 
 /*
- * A view in the orbit's frame, rows and columns exchanged where the detector is on its side, and the geometry with the
- * sides of that detector, its views those given and borrowed. For core/orbit*.c only.
+ * A view about the orbit's centre in its frame, rows and columns exchanged where the detector is on its side, and the
+ * geometry with the sides of that detector, its views those given and borrowed. For core/orbit*.c only.
  */
 struct view orbit_view(const struct orbit *orbit, const struct view *view);
 struct geometry orbit_sides(const struct orbit *orbit, const struct geometry *geometry);
 /*
- * For core/orbit*.c only, too, and of that geometry: a view about the orbit's centre; the angle of the ray through
- * (column, middle row) of such a view against the line from source to axis, counter-clockwise seen from +z; where the
- * detector's middle row meets the axis, mm along it from the centre, in the mean of all views, NAN where it does not.
+ * For core/orbit*.c only, too, and of that geometry: the angle of the ray through (column, middle row) of such a view
+ * against the line from source to axis, counter-clockwise seen from +z; where the detector's middle row meets the axis,
+ * mm along it from the centre, in the mean of all views, NAN where it does not; the field of view, the cylinder about
+ * the centre that the detector's outer edges leave; the fan angle up to which a displaced detector sees both sides of
+ * the axis in every view, negative where it does not see the axis.
  */
-struct view orbit_centred_view(const struct orbit *orbit, const struct view *view);
 double orbit_ray_angle(const struct geometry *geometry, const struct view *view, double column);
 double orbit_middle_row(const struct orbit *orbit, const struct geometry *geometry);
-/* Sets centre and field_of_view; the rest is known. */
-void orbit_find_centre(struct orbit *orbit, const struct geometry *geometry);
+double orbit_field_of_view(const struct orbit *orbit, const struct geometry *geometry);
+double orbit_overlap(const struct orbit *orbit, const struct geometry *geometry);
+/* Sets the centre of an orbit described about the origin; true if it is beside that, so that all is to be described
+ * again. */
+bool orbit_find_centre(struct orbit *orbit, const struct geometry *geometry);
 
 /* A place in the world from the centre, in the frame; and how far it is from the axis through the centre, mm. */
 void orbit_from_centre(const struct orbit *orbit, const double place[3], double ret[3]);

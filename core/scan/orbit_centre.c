@@ -3,17 +3,6 @@
 
 #include "core/scan/orbit.h"
 
-struct view orbit_centred_view(const struct orbit *orbit, const struct view *view)
-{
-	struct view from = *view;
-
-	for (int i = 0; i < 3; i++) {
-		from.source[i] -= orbit->centre[i];
-		from.pixel0[i] -= orbit->centre[i];
-	}
-	return orbit_view(orbit, &from);
-}
-
 void orbit_from_centre(const struct orbit *orbit, const double place[3], double ret[3])
 {
 	double from[3];
@@ -37,14 +26,13 @@ bool orbit_is_in_view(const struct orbit *orbit, const double place[3])
 	return orbit_from_axis(orbit, place) <= orbit->field_of_view / 2;
 }
 
-/* The orbit's field of view about its centre, the cylinder that the detector's outer edges leave. */
-static double field_of_view(const struct orbit *orbit, const struct geometry *geometry)
+double orbit_field_of_view(const struct orbit *orbit, const struct geometry *geometry)
 {
 	const double sense = orbit->direction < 0 ? -1 : 1;
 	double low_side = INFINITY, high_side = INFINITY;
 
 	for (int k = 0; k < geometry->count; k++) {
-		const struct view view = orbit_centred_view(orbit, &geometry->views[k]);
+		const struct view view = orbit_view(orbit, &geometry->views[k]);
 		const double radius = hypot(view.source[0], view.source[1]);
 		const double edge0 = sense * orbit_ray_angle(geometry, &view, -0.5);
 		const double edge1 = sense * orbit_ray_angle(geometry, &view, geometry->columns - 0.5);
@@ -95,7 +83,7 @@ double orbit_middle_row(const struct orbit *orbit, const struct geometry *geomet
 	double sum = 0;
 
 	for (int k = 0; k < geometry->count; k++) {
-		const struct view view = orbit_centred_view(orbit, &geometry->views[k]);
+		const struct view view = orbit_view(orbit, &geometry->views[k]);
 		double matrix[12], slope;
 
 		view_matrix(&view, matrix);
@@ -114,7 +102,7 @@ static bool is_off_rows(const struct orbit *orbit, const struct geometry *geomet
 	int off = 0;
 
 	for (int k = 0; k < geometry->count; k++) {
-		const struct view view = orbit_centred_view(orbit, &geometry->views[k]);
+		const struct view view = orbit_view(orbit, &geometry->views[k]);
 		double matrix[12], column, row;
 
 		view_matrix(&view, matrix);
@@ -130,19 +118,22 @@ static void move_centre(struct orbit *orbit, const double by[3])
 			orbit->centre[j] += by[i] * orbit->frame[i][j];
 }
 
-void orbit_find_centre(struct orbit *orbit, const struct geometry *geometry)
+bool orbit_find_centre(struct orbit *orbit, const struct geometry *geometry)
 {
-	const double wider = 1.05;
+	const double wider = 1.05, enough = 0.5;
 	struct orbit moved = *orbit;
 	double by[3] = {0}, height;
+	bool beside;
 
-	orbit->field_of_view = field_of_view(orbit, geometry);
 	circle_middle(orbit, geometry, by);
 	move_centre(&moved, by);
-	moved.field_of_view = field_of_view(&moved, geometry);
-	if (moved.field_of_view > wider * orbit->field_of_view)
+	moved.field_of_view = orbit_field_of_view(&moved, geometry);
+	beside = moved.field_of_view > wider * orbit->field_of_view ||
+		 (orbit->displaced && orbit_overlap(orbit, geometry) < enough * orbit_overlap(&moved, geometry));
+	if (beside)
 		*orbit = moved;
 	height = orbit_middle_row(orbit, geometry);
 	if (geometry->rows > 1 && is_off_rows(orbit, geometry) && isfinite(height))
 		move_centre(orbit, (const double[]){0, 0, height});
+	return beside;
 }

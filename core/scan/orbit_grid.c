@@ -16,7 +16,7 @@ static double half_height(const struct orbit *orbit, const struct geometry *geom
 	double farthest = 0;
 
 	for (int k = 0; k < geometry->count; k++) {
-		const struct view turned = orbit_centred_view(orbit, &geometry->views[k]), *view = &turned;
+		const struct view turned = orbit_view(orbit, &geometry->views[k]), *view = &turned;
 		double radius = hypot(view->source[0], view->source[1]);
 
 		for (int end = 0; end < 2; end++) {
@@ -51,7 +51,7 @@ static double grid_width(const struct orbit *orbit, const struct geometry *geome
 	double width = orbit->field_of_view, nearest = INFINITY;
 
 	for (int k = 0; k < geometry->count; k++) {
-		const struct view view = orbit_centred_view(orbit, &geometry->views[k]);
+		const struct view view = orbit_view(orbit, &geometry->views[k]);
 
 		nearest = fmin(nearest, hypot(view.source[0], view.source[1]));
 	}
@@ -121,7 +121,7 @@ static void find_common_range(const struct orbit *orbit, const struct geometry *
 	ret_range[0] = -INFINITY;
 	ret_range[1] = INFINITY;
 	for (int k = 0; k < geometry->count; k++) {
-		const struct view view = orbit_centred_view(orbit, &geometry->views[k]);
+		const struct view view = orbit_view(orbit, &geometry->views[k]);
 		double matrix[12];
 
 		view_matrix(&view, matrix);
@@ -286,7 +286,7 @@ int orbit_unseen_slices(const struct orbit *orbit, const struct geometry *given,
 	if (matrices == NULL)
 		return error_set(err, ERR_NO_MEMORY, "no memory for %d matrices", geometry->count);
 	for (int k = 0; k < geometry->count; k++) {
-		const struct view view = orbit_centred_view(orbit, &geometry->views[k]);
+		const struct view view = orbit_view(orbit, &geometry->views[k]);
 
 		view_matrix(&view, matrices[k]);
 	}

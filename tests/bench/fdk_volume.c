@@ -21,7 +21,7 @@ int fdk_volume(const struct backend *backend, const struct geometry *geometry, e
 	options.column_weights = weights.columns;
 	options.filter_response = weights.response;
 	memcpy(options.pad, weights.pad, sizeof(options.pad));
-	memcpy(options.axis, weights.axis, sizeof(options.axis));
+	options.axis = weights.axis;
 	options.extend = weights.extend;
 	options.extended_response = weights.extended;
 	options.linearise.sample = SAMPLE_FLOAT32;

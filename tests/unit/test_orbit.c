@@ -1013,6 +1013,75 @@ START_TEST(slices_of_a_default_grid_lie_on_rows)
 }
 END_TEST
 
+static void move_views(struct geometry *geometry, const double by[3])
+{
+	for (int k = 0; k < geometry->count; k++)
+		for (int a = 0; a < 3; a++) {
+			geometry->views[k].source[a] += by[a];
+			geometry->views[k].pixel0[a] += by[a];
+		}
+}
+
+/*
+ * Whatever place of the world the axis goes through: the same arc, fan, displacement, and FDK's weights. About the
+ * origin a displaced detector that did not see it from both sides weighed no ray twice, and a short scan's arc was
+ * another one by some degrees.
+ */
+START_TEST(an_orbit_beside_the_origin_is_told_about_its_own_axis)
+{
+	static const struct sweep sweeps[] = {{64, 36, 2, 0, 6, 60, {0, 0}, 0},
+					      {64, 36, 2, 30, -210.0 / 59, 60, {0, 0}, 0},
+					      {64, 36, 2, 0, 6, 60, {48, 0}, 0},
+					      {64, 36, 2, 70, -6, 60, {-50, 3}, 0.05},
+					      {64, 36, 2, 70, 3.6, 60, {4, 0}, 0.05}};
+	static const double moves[][3] = {{20, -10, 0}, {-45, 0, 0}, {12, 0, 0}, {0, 60, -9}};
+	enum { MOVES = sizeof(moves) / sizeof(*moves), COLUMNS = 64 };
+
+	for (size_t i = 0; i < 5 * MOVES; i++) {
+		struct geometry still = geometry_of(&sweeps[i / MOVES], NULL),
+				moved = geometry_of(&sweeps[i / MOVES], NULL);
+		const size_t pixels = (size_t)still.count * COLUMNS;
+		float *weights = malloc(sizeof(float) * pixels), *others = malloc(sizeof(float) * pixels);
+		struct orbit expected, orbit;
+
+		move_views(&moved, moves[i % MOVES]);
+		expected = orbit_of(&still);
+		orbit = orbit_of(&moved);
+		ck_assert_double_eq_tol(orbit.arc, expected.arc, 1e-9);
+		ck_assert_int_eq(orbit.first, expected.first);
+		ck_assert_int_eq(orbit.displaced, expected.displaced);
+		ck_assert_int_eq(orbit.short_scan, expected.short_scan);
+		ck_assert_int_eq(orbit.arc_too_short, expected.arc_too_short);
+		ck_assert_double_eq_tol(orbit.fan, expected.fan, 1e-9);
+		ck_assert_double_eq_tol(orbit.source_radius, expected.source_radius, 1e-6);
+		ck_assert_double_eq_tol(orbit.field_of_view, expected.field_of_view, 1e-6);
+		ck_assert_double_eq_tol(orbit.displacement, expected.displacement, 1e-6);
+		ck_assert_double_eq_tol(orbit.pixel_at_isocentre[0], expected.pixel_at_isocentre[0], 1e-9);
+		for (int end = 0; end < 2; end++)
+			ck_assert_int_eq(orbit.pad[end], expected.pad[end]);
+		ck_assert(weights != NULL && others != NULL);
+		orbit_column_weights(&expected, &still, weights);
+		orbit_column_weights(&orbit, &moved, others);
+		for (size_t p = 0; p < pixels; p++) {
+			/* Backprojection has the depth of the world's origin squared. */
+			double matrix[12], depth;
+
+			view_matrix(&still.views[p / COLUMNS], matrix);
+			depth = matrix[11];
+			view_matrix(&moved.views[p / COLUMNS], matrix);
+			ck_assert_double_eq_tol((double)others[p] * pow(matrix[11] / depth, 2), weights[p],
+						1e-5 * (double)weights[p] + 1e-9);
+		}
+		free(weights);
+		free(others);
+		orbit_clear(&orbit);
+		orbit_clear(&expected);
+		geometry_clear(&still);
+		geometry_clear(&moved);
+	}
+}
+END_TEST
+
 /*
  * Calibrated on a phantom that was set down beside it, an arm turns about an axis beside the origin: the grid is about
  * that axis, and has all of the field of view. It was the circle about the origin that all views see, so that bodies
@@ -1035,11 +1104,7 @@ START_TEST(a_default_grid_is_about_an_axis_beside_the_origin)
 
 		orbit_default_grid(&orbit, &geometry, 512, &still);
 		orbit_clear(&orbit);
-		for (int k = 0; k < geometry.count; k++)
-			for (int a = 0; a < 3; a++) {
-				geometry.views[k].source[a] += by[a];
-				geometry.views[k].pixel0[a] += by[a];
-			}
+		move_views(&geometry, by);
 		orbit = orbit_of(&geometry);
 		orbit_default_grid(&orbit, &geometry, 512, &grid);
 		for (int a = 0; a < 3; a++) {
@@ -1229,6 +1294,7 @@ Suite *orbit_suite(void)
 	tcase_add_test(grids, a_default_grid_exists_for_any_orbit);
 	tcase_add_test(grids, slices_of_a_default_grid_lie_on_rows);
 	tcase_add_test(grids, a_default_grid_is_about_an_axis_beside_the_origin);
+	tcase_add_test(facts, an_orbit_beside_the_origin_is_told_about_its_own_axis);
 	suite_add_tcase(suite, grids);
 	return suite;
 }

@@ -71,6 +71,51 @@ START_TEST(fdk_of_a_ball_is_its_density)
 }
 END_TEST
 
+static void move_scene(struct scene *scene, struct grid *grid, const double by[3])
+{
+	for (int a = 0; a < 3; a++) {
+		grid->origin[a] += by[a];
+		for (int k = 0; k < scene->geometry.count; k++) {
+			scene->geometry.views[k].source[a] += by[a];
+			scene->geometry.views[k].pixel0[a] += by[a];
+		}
+	}
+}
+
+/*
+ * The world's origin is a name: FDK of what lies elsewhere in it, with the arm and the grid, is the same, the corners
+ * of the grid beyond the field of view, too. About the origin a displaced detector made 200 HU and more of it.
+ */
+START_TEST(fdk_is_the_same_about_an_axis_beside_the_origin)
+{
+	static const double by[] = {31, -24, 0}, places[][3] = {{0, 0, 0}, {16, -5, 9}, {-17, -17, 8}};
+	struct grid grid = grid_of(41, 41, 9, 3, 3, 3);
+	struct outcome outcomes[2] = {0};
+	const float *volumes[2];
+	float worst = 0;
+
+	for (int i = 0; i < 2; i++) {
+		struct recipe recipe = recipe_on(&grid);
+		struct scene scene;
+
+		recipe.fdk.on = true;
+		scene_orbit(&scene, &orbits[_i].spec);
+		for (int b = 0; b < 3; b++)
+			add_ball(&scene, b > 0 ? 9 : 40, 0.02, places[b][0], places[b][1], places[b][2]);
+		if (i == 1)
+			move_scene(&scene, &recipe.grid, by);
+		run(&scene, &recipe, &outcomes[i]);
+		volumes[i] = outcome_volume(&outcomes[i], "final");
+		scene_clear(&scene);
+	}
+	for (size_t v = 0; v < grid_voxels(&grid); v++)
+		worst = fmaxf(worst, fabsf(volumes[1][v] - volumes[0][v]));
+	ck_assert_msg(worst < 1e-5F, "%s: %g / mm", orbits[_i].name, (double)worst);
+	for (int i = 0; i < 2; i++)
+		outcome_clear(&outcomes[i]);
+}
+END_TEST
+
 /*
  * Three columns are a seventh of the width of a coarse detector: beyond its near edge every place is seen by half of
  * the views, and has half of its density where rays are not weighed for that.
@@ -2472,6 +2517,7 @@ Suite *recon_suite(void)
 	tcase_set_timeout(subsets, 0);
 
 	tcase_add_loop_test(images, fdk_of_a_ball_is_its_density, 0, ORBITS);
+	tcase_add_loop_test(images, fdk_is_the_same_about_an_axis_beside_the_origin, 0, ORBITS);
 	tcase_add_loop_test(images, fdk_of_a_ball_reaches_to_the_far_edge_of_a_coarse_detector, 0, 2);
 	/* Of FDK the even orbits, of SART the odd ones; the others are long. */
 	for (int i = 0; i < ORBITS; i++) {
