@@ -32,8 +32,11 @@
  * rows still says it, or where the rays that opposite views share agree better with the views moved by it. Edges that
  * are finer than the bins move a view as a whole; a shift with which these rays agree worse by far does not count.
  *
+ * FDK filters along rows: where these lean by more than 4 degrees its volume is not the object, and is not asked.
+ *
  * Large departures of all views, an arm that turned the other way and a detector far aside, are told by the rays that
- * opposite views have in common (opposite.h), which need no volume. Of scans of 32 to 63 views nothing else is asked.
+ * opposite views have in common (opposite.h), which need no volume. Of scans of 32 to 63 views, and of leaning rows,
+ * nothing else is asked.
  */
 enum { AGREEMENT_VIEWS_MOST = 120, AGREEMENT_BINS_MOST = 80 };
 

@@ -464,6 +464,56 @@ START_TEST(flat_faces_beyond_the_detector_are_not_doubted)
 }
 END_TEST
 
+/* Turns a detector in its plane about its middle pixel. */
+static void roll(struct geometry *geometry, double angle)
+{
+	const double c = cos(angle), s = sin(angle);
+
+	for (int k = 0; k < geometry->count; k++) {
+		struct view *view = &geometry->views[k];
+
+		for (int i = 0; i < 3; i++) {
+			const double u = view->column_step[i], v = view->row_step[i];
+
+			view->column_step[i] = c * u + s * v;
+			view->row_step[i] = c * v - s * u;
+			view->pixel0[i] += 0.5 * (geometry->columns - 1) * (u - view->column_step[i]) +
+					   0.5 * (geometry->rows - 1) * (v - view->row_step[i]);
+		}
+	}
+}
+
+/*
+ * FDK filters along rows. Where these lean, its volume of half of the views is none of the object's, and says nothing
+ * of a geometry that is known exactly; a body with flat ends had 80 to 99 % of its detail unexplained.
+ */
+START_TEST(a_detector_that_is_turned_in_its_plane_is_not_doubted)
+{
+	static const double arcs[] = {200, 360}, rolls[] = {3, 4.5, 6, 10, -10};
+	const struct ellipsoid parts[] = {
+	    {.shape = SHAPE_CYLINDER, .semi_axes = {62, 62, 44}, .centre = {0, 0, 4}, .density = .0192},
+	    {.shape = SHAPE_ELLIPSOID, .semi_axes = {10, 10, 10}, .centre = {20, 15, 9}, .density = .006}};
+	const struct arm arm = arm_of(arcs[_i % 2]);
+	const size_t pixels = (size_t)COLUMNS * ROWS;
+	float *projections = malloc(VIEWS * pixels * sizeof(*projections));
+	struct geometry rolled = circle_of(&arm);
+	struct figures found;
+
+	ck_assert_ptr_nonnull(projections);
+	roll(&rolled, rolls[_i / 2] * M_PI / 180);
+	for (int k = 0; k < VIEWS; k++)
+		phantom_project(&(struct phantom){.count = 2, .parts = (struct ellipsoid *)parts}, &rolled, k,
+				projections + (size_t)k * pixels);
+	found = check(&rolled, projections, false, -1);
+	ck_assert_msg(agreement_grade(&found.agreement, found.bin) == AGREEMENT_GOOD,
+		      "%g degrees: %g mm +- %g, unexplained %g", rolls[_i / 2], found.agreement.mm,
+		      found.agreement.sigma_mm, found.agreement.unexplained);
+	agreement_clear(&found.agreement);
+	geometry_clear(&rolled);
+	free(projections);
+}
+END_TEST
+
 /*
  * Flat ends and half of the views for the outer rays move all views to one side: what opposite rays deny, or a shift of
  * the object along z explains.
@@ -769,6 +819,7 @@ Suite *agreement_suite(void)
 	tcase_add_loop_test(known, a_truncated_head_is_accused_of_no_more_than_is_wrong, 0,
 			    (int)(sizeof(cuts) / sizeof(cuts[0])));
 	tcase_add_loop_test(known, flat_faces_beyond_the_detector_are_not_doubted, 0, 3);
+	tcase_add_loop_test(known, a_detector_that_is_turned_in_its_plane_is_not_doubted, 0, 10);
 	tcase_add_loop_test(known, a_tube_that_drifts_is_told_without_air, 0, 5);
 	tcase_add_test(known, a_short_cylinder_under_a_displaced_detector_is_not_doubted);
 	tcase_add_loop_test(known, a_detector_aside_of_a_truncated_abdomen_is_told, 0, 4);
