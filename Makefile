@@ -195,7 +195,7 @@ $(BUILD)/cbctd-without-postgresql: $(filter-out $(BUILD)/daemon/store/postgresql
 
 gpu_programs := $(BUILD)/gpu_check $(BUILD)/gpu_bench $(BUILD)/gpu_cards $(BUILD)/gpu_large
 # Every program that a test or a benchmark runs, so that none stops compiling unseen.
-test-programs: $(addprefix $(BUILD)/,unit member cbct-worker-held cbctd-held cbctd-without-postgresql manual faults.so clock.so every.so live_bytes.so simulated-nvml/libnvidia-ml.so.1 cpu-bench calibrate-bench phantoms agreement breathing refine denoise presets stopping methods watchers slices acquire paper-project rabbitct $(if $(postgresql),claims)) \
+test-programs: $(addprefix $(BUILD)/,unit member cbct-worker-held cbctd-held cbctd-without-postgresql manual faults.so clock.so every.so live_bytes.so simulated-nvml/libnvidia-ml.so.1 cpu-bench calibrate-bench phantoms agreement breathing scatter refine denoise presets stopping methods watchers slices acquire paper-project rabbitct $(if $(postgresql),claims)) \
                $(if $(cuda_objects),$(gpu_programs) $(BUILD)/gpu_ceilings $(BUILD)/cbct-worker-faulty,$(call objects,$(wildcard tests/bench/gpu_*.c)))
 
 # What tests ask of JSON documents by the thousand.
@@ -251,6 +251,9 @@ $(BUILD)/agreement: $(call objects,tests/bench/agreement.c tests/bench/bodies.c 
 
 # Who is told to have breathed.
 $(BUILD)/breathing: $(call objects,tests/bench/breathing.c tests/bench/bodies.c tests/unit/arm.c) $(library)
+	$(call say,LINK)$(CC) $(LDFLAGS) -o $@ $^ $(call pkg,--libs,$(core_libs)) $(LIBM)
+
+$(BUILD)/scatter: $(call objects,tests/bench/scatter.c tests/bench/fdk_volume.c tests/unit/exposures.c tests/unit/montecarlo.c) $(library)
 	$(call say,LINK)$(CC) $(LDFLAGS) -o $@ $^ $(call pkg,--libs,$(core_libs)) $(LIBM)
 
 # What the refinement makes of such scans.
@@ -376,6 +379,10 @@ bench-agreement: setup ## what the check of the geometry says of known scans, on
 bench-breathing: setup ## who is told to have breathed, of known scans, on standard output
 	@$(MAKE) --no-print-directory -j$$(nproc) $(BUILD)/breathing >&2
 	@$(BUILD)/breathing
+
+bench-scatter: setup ## HU that scatter leaves, as it is and taken off by fitted models, on standard output
+	@$(MAKE) --no-print-directory -j$$(nproc) $(BUILD)/scatter >&2
+	@$(BUILD)/scatter
 
 bench-refine: setup ## what the refinement makes of known scans, on standard output
 	@$(MAKE) --no-print-directory -j$$(nproc) $(BUILD)/refine >&2
@@ -539,6 +546,6 @@ clean: ## removes build/
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z_.-]+:.*## /{printf "  make %-21s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
 
-.PHONY: all test-programs for-tests again setup demo check soak fuzz fuzzers paper paper-report bench bench-agreement bench-breathing bench-refine bench-calibrate bench-phantoms bench-denoise bench-presets bench-stopping bench-methods check-gpu bench-gpu asan tsan lint format rooms pictures third-party compile_commands.json install deb container sbom reproducible clean help
+.PHONY: all test-programs for-tests again setup demo check soak fuzz fuzzers paper paper-report bench bench-agreement bench-breathing bench-scatter bench-refine bench-calibrate bench-phantoms bench-denoise bench-presets bench-stopping bench-methods check-gpu bench-gpu asan tsan lint format rooms pictures third-party compile_commands.json install deb container sbom reproducible clean help
 .SECONDARY:
 -include $(shell find $(BUILD) -path $(BUILD)/test -prune -o -type f -name '*.d' -print 2>/dev/null)

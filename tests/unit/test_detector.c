@@ -15,8 +15,7 @@
 #include "core/correct/scatter_spikes.h"
 #include "core/fit/hardening.h"
 #include "core/fit/lag.h"
-#include "core/fit/scatter.h"
-#include "tests/unit/montecarlo.h"
+#include "tests/unit/exposures.h"
 #include "tests/unit/scene.h"
 
 Suite *detector_suite(void);
@@ -292,37 +291,8 @@ END_TEST
 /* ---- scatter ---- */
 
 static const struct scatter_beam BEAM = {{4, 4}, 1100, 620, {49.5, 37.5}};
-enum { WIDE = 100, HIGH = 76, ACROSS = 20, ALONG = 15, ANGLES = 8, TURNS = 96 };
+enum { ANGLES = 8, TURNS = 96 };
 static const struct orbit_spec scattering = {WIDE, HIGH, TURNS, {620, 1100, {4, 4}, {0, 0}, {0, 0}}, 0, 3.75};
-
-/* Bilinear between the centres of Monte Carlo's cells. */
-static double cell_value(const float *cells, int column, int row)
-{
-	const double x = fmin(fmax((column + 0.5) * ACROSS / WIDE - 0.5, 0), ACROSS - 1.001);
-	const double y = fmin(fmax((row + 0.5) * ALONG / HIGH - 0.5, 0), ALONG - 1.001);
-	const int i = (int)x, j = (int)y;
-	const float *at = cells + j * ACROSS + i;
-
-	return (1 - (y - j)) * ((1 - (x - i)) * (double)at[0] + (x - i) * (double)at[1]) +
-	       (y - j) * ((1 - (x - i)) * (double)at[ACROSS] + (x - i) * (double)at[ACROSS + 1]);
-}
-
-/* Primary and scatter of one exposure, against air. */
-static struct scatter_exposure expose(const struct phantom *phantom, const struct geometry *geometry, int photons)
-{
-	const struct montecarlo montecarlo = {phantom, geometry, 260, ACROSS, ALONG, photons, 7};
-	float cells[ACROSS * ALONG], *total = malloc(sizeof(float) * WIDE * HIGH);
-	float *scatter = malloc(sizeof(float) * WIDE * HIGH);
-
-	ck_assert(total != NULL && scatter != NULL);
-	phantom_project(phantom, geometry, 0, total);
-	montecarlo_scatter(&montecarlo, 0, cells);
-	for (int i = 0; i < WIDE * HIGH; i++) {
-		scatter[i] = (float)cell_value(cells, i % WIDE, i / WIDE);
-		total[i] = expf(-total[i]);
-	}
-	return (struct scatter_exposure){total, scatter};
-}
 
 static struct geometry some_views(int count)
 {
@@ -336,85 +306,32 @@ static struct geometry some_views(int count)
 	return scene.geometry;
 }
 
-/* Plates that do not cover the beam, and bottles of water. */
-enum { FITTED = 6, BOTTLES = 3 /* the first of them */ };
 static void expose_all(int photons, int first, struct scatter_exposure ret[FITTED])
 {
-	struct ellipsoid parts[FITTED] = {
-	    {.shape = SHAPE_BOX, .semi_axes = {40, 60, 60}, .density = WATER},
-	    {.shape = SHAPE_BOX, .semi_axes = {80, 70, 70}, .density = WATER},
-	    {.shape = SHAPE_BOX, .semi_axes = {70, 60, 160}, .centre = {0, 40, 0}, .density = WATER},
-	    {.shape = SHAPE_CYLINDER, .semi_axes = {50, 50, 100}, .density = WATER},
-	    {.shape = SHAPE_CYLINDER, .semi_axes = {75, 75, 90}, .density = WATER},
-	    {.shape = SHAPE_CYLINDER, .semi_axes = {60, 90, 100}, .centre = {0, -30, 10}, .density = WATER},
-	};
 	struct geometry geometry = some_views(1);
 
-#pragma omp parallel for schedule(dynamic)
-	for (int i = first; i < FITTED; i++)
-		ret[i] = expose(&(struct phantom){.count = 1, .parts = &parts[i]}, &geometry, photons);
+	exposures_make(&geometry, photons, first, ret);
 	geometry_clear(&geometry);
 }
 
-/*
- * Kernels for that beam whose scatter is `scale` times as much, as another grid makes it. Or, without any, a body, from
- * the bottles alone: a thick plate that does not cover the beam is before or behind the isocentre where rays pass its
- * sides, and no body as the model has it.
- */
 static void fit_scatter(const struct scatter_exposure exposures[FITTED], double scale, int kernels,
 			struct scatter_fit *ret)
 {
-	const int first = kernels > 0 ? 0 : BOTTLES;
-	struct scatter_exposure scaled[FITTED];
-	float *all = malloc(sizeof(float) * 2 * FITTED * WIDE * HIGH);
 	struct error err;
 
-	ck_assert_ptr_nonnull(all);
-	for (int i = first; i < FITTED; i++) {
-		float *total = all + (size_t)(2 * i) * WIDE * HIGH, *scatter = total + WIDE * HIGH;
-
-		for (int k = 0; k < WIDE * HIGH; k++) {
-			scatter[k] = (float)scale * exposures[i].scatter[k];
-			total[k] = exposures[i].total[k] + scatter[k];
-		}
-		scaled[i] = (struct scatter_exposure){total, scatter};
-	}
-	ck_assert_msg(scatter_fit(scaled + first, FITTED - first, WIDE, HIGH, &BEAM, kernels, ret, &err) == 0, "%s",
-		      err.text);
-	free(all);
+	ck_assert_msg(exposures_fit(exposures, &BEAM, scale, kernels, ret, &err) == 0, "%s", err.text);
 }
-
-/* A head with a skull, and a thigh with its bone; a flat part of each, by its centre and radius. */
-static struct ellipsoid head[] = {
-    {.semi_axes = {75, 92, 95}, .density = 1.9 * 0.0192},
-    {.semi_axes = {69, 86, 89}, .density = -0.9 * 0.0192},
-    {.semi_axes = {10, 20, 20}, .centre = {30, 10, 0}, .density = -0.2 * 0.0192},
-};
-static struct ellipsoid thigh[] = {
-    {.shape = SHAPE_CYLINDER, .semi_axes = {70, 75, 120}, .density = 0.0192},
-    {.shape = SHAPE_CYLINDER, .semi_axes = {17, 17, 120}, .centre = {-20, 8, 0}, .density = 0.9 * 0.0192},
-};
-static const struct patient {
-	const char *name;
-	struct phantom phantom;
-	double flat[4][3];
-	double radius;
-} patients[] = {
-    {"head", {3, head}, {{0, 0, 0}, {-30, 0, 0}, {0, -40, 0}, {0, 50, 0}}, 10},
-    {"thigh", {2, thigh}, {{15, 0, 0}, {0, -40, 0}, {0, 45, 0}, {35, 0, 0}}, 10},
-};
 
 /* Scatter of some angles, [angle][cell]. */
 static float *scatter_of(const struct phantom *phantom)
 {
 	struct geometry geometry = some_views(ANGLES);
-	const struct montecarlo montecarlo = {phantom, &geometry, 260, ACROSS, ALONG, 2500, 11};
-	float *cells = malloc(sizeof(float) * ANGLES * ACROSS * ALONG);
+	float *cells = malloc(sizeof(float) * ANGLES * CELLS);
 
 	ck_assert_ptr_nonnull(cells);
 #pragma omp parallel for schedule(dynamic)
 	for (int i = 0; i < ANGLES; i++)
-		montecarlo_scatter(&montecarlo, i, cells + i * ACROSS * ALONG);
+		exposed_scatter(phantom, &geometry, i, 2500, 11, cells + (ptrdiff_t)i * CELLS);
 	geometry_clear(&geometry);
 	return cells;
 }
@@ -428,8 +345,8 @@ static float *counts_with_scatter(const struct scene *scene, const float *cells,
 	for (int view = 0; view < TURNS; view++) {
 		const double at = (double)view * ANGLES / TURNS;
 		const int before = (int)at;
-		const float *first = cells + before * ACROSS * ALONG;
-		const float *second = cells + (before + 1) % ANGLES * ACROSS * ALONG;
+		const float *first = cells + before * CELLS;
+		const float *second = cells + (before + 1) % ANGLES * CELLS;
 
 		for (int i = 0; i < WIDE * HIGH; i++) {
 			const int pixel = view * WIDE * HIGH + i;
@@ -443,7 +360,7 @@ static float *counts_with_scatter(const struct scene *scene, const float *cells,
 }
 
 /* The mean error in flat parts, HU. */
-static double flat_error(const struct patient *patient, const struct outcome *got, const struct outcome *ideal)
+static double flat_error(const struct exposed_body *patient, const struct outcome *got, const struct outcome *ideal)
 {
 	double sum = 0;
 
@@ -458,7 +375,7 @@ static double flat_error(const struct patient *patient, const struct outcome *go
  * What is left in the flat parts of a scan with so much scatter, against the scan without; by one kernel, or a body. A
  * body is tried at the last level alone, where most is left.
  */
-static void correct(const struct patient *patient, const struct scatter_exposure exposures[FITTED])
+static void correct(const struct exposed_body *patient, const struct scatter_exposure exposures[FITTED])
 {
 	const double ratios[] = {0.2, 0.5, 1};
 	const struct recipe recipe = fdk_on(52, 16, 4);
@@ -514,26 +431,12 @@ START_TEST(scatter_is_taken_off_objects_that_its_model_was_not_fitted_on)
 	struct scatter_exposure exposures[FITTED];
 
 	expose_all(2500, 0, exposures);
-	correct(&patients[_i], exposures);
-	for (int i = 0; i < FITTED; i++) {
-		free((void *)exposures[i].total);
-		free((void *)exposures[i].scatter);
-	}
+	correct(&exposed_bodies[_i], exposures);
+	exposures_clear(exposures);
 }
 END_TEST
 
-/* An abdomen 260 mm thick, and a pelvis seen from the front. */
-static struct ellipsoid abdomen[] = {
-    {.shape = SHAPE_CYLINDER, .semi_axes = {130, 130, 150}, .density = 0.0192},
-    {.shape = SHAPE_CYLINDER, .semi_axes = {20, 22, 150}, .centre = {-75, 0, 0}, .density = 0.5 * 0.0192},
-    {.semi_axes = {60, 45, 70}, .centre = {20, -60, 0}, .density = 0.05 * 0.0192},
-};
-static struct ellipsoid pelvis[] = {
-    {.shape = SHAPE_CYLINDER, .semi_axes = {115, 175, 150}, .density = 0.0192},
-    {.semi_axes = {24, 24, 24}, .centre = {-10, 95, 10}, .density = 0.8 * 0.0192},
-    {.semi_axes = {24, 24, 24}, .centre = {-10, -95, 10}, .density = 0.8 * 0.0192},
-};
-static const struct phantom large[] = {{3, abdomen}, {3, pelvis}};
+static const int large[] = {EXPOSED_ABDOMEN, EXPOSED_PELVIS};
 
 /*
  * A body that was fitted on bottles takes the scatter off far larger ones, in a wider beam over other distances: a
@@ -550,16 +453,16 @@ START_TEST(a_body_holds_for_larger_ones_and_other_distances)
 	expose_all(10000, BOTTLES, exposures);
 	fit_scatter(exposures, 1, 0, &fit);
 	for (int body = 0; body < 2; body++) {
-		float cells[ACROSS * ALONG], total[WIDE * HIGH], line[WIDE];
+		const struct phantom *phantom = &exposed_bodies[large[body]].phantom;
+		float cells[CELLS], total[WIDE * HIGH], line[WIDE];
 		struct scatter *scatter;
 		struct scene scene;
 		struct error err;
 		double most = 0;
 
 		scene_orbit(&scene, &spec);
-		scene_add(&scene, &large[body]);
-		montecarlo_scatter(&(struct montecarlo){&large[body], &scene.geometry, 260, ACROSS, ALONG, PHOTONS, 5},
-				   0, cells);
+		scene_add(&scene, phantom);
+		exposed_scatter(phantom, &scene.geometry, 0, PHOTONS, 5, cells);
 		for (int i = 0; i < WIDE * HIGH; i++)
 			total[i] = (float)(exp(-(double)scene.projections[i]) + cell_value(cells, i % WIDE, i / WIDE));
 		ck_assert_int_eq(scatter_new(&fit.model, WIDE, HIGH, &beam, &scatter, &err), 0);
@@ -580,10 +483,7 @@ START_TEST(a_body_holds_for_larger_ones_and_other_distances)
 		scatter_free(scatter);
 		scene_clear(&scene);
 	}
-	for (int i = BOTTLES; i < FITTED; i++) {
-		free((void *)exposures[i].total);
-		free((void *)exposures[i].scatter);
-	}
+	exposures_clear(exposures);
 }
 END_TEST
 
@@ -784,7 +684,7 @@ static struct linearise with_images(const struct given_images *given)
  */
 START_TEST(scatter_is_taken_off_by_coarse_images_of_some_views)
 {
-	const struct patient *patient = &patients[0];
+	const struct exposed_body *patient = &exposed_bodies[0];
 	const double ratios[] = {0.2, 0.5, 1};
 	const struct recipe recipe = fdk_on(52, 16, 4);
 	const int amid = HIGH / 2 * WIDE + WIDE / 2;
@@ -1026,14 +926,14 @@ START_TEST(images_of_scatter_that_cannot_be_are_told)
 	const float factors[] = {3e-5F, 40, 0, 4, 0.25F};
 	const char *const told[] = {
 	    "scatter_faint: ", "scatter_exceeds: ", "scatter_uneven: ", "scatter_uneven: ", "scatter_uneven: "};
-	float cells[ANGLES * ACROSS * ALONG], *counts;
+	float cells[ANGLES * CELLS], *counts;
 	struct outcome with = {0};
 	struct given_images given;
 	struct scene scene;
 
 	scene_orbit(&scene, &scattering);
-	scene_add(&scene, &patients[1].phantom);
-	for (int i = 0; i < ANGLES * ACROSS * ALONG; i++)
+	scene_add(&scene, &exposed_bodies[1].phantom);
+	for (int i = 0; i < ANGLES * CELLS; i++)
 		cells[i] = 0.05F;
 	counts = counts_with_scatter(&scene, cells, 1);
 	make_images(&scene, counts, &given);
