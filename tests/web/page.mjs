@@ -768,6 +768,16 @@ test('a calibration comes into the list, tells its residuals projection by proje
 
 	/* German words are longer. */
 	const german = await open(browser, `/#/calibrations/${made.id}`, { locale: 'de-DE' })
+	/* Behind German words what the daemon says is marked as English, a refused view's reason and a problem. */
+	const english = element => german.locator(`${element} [lang=en]`).allTextContents()
+	await until('the reasons', () => english('.calibration .refused'), texts => JSON.stringify(texts) === JSON.stringify(refused.map(k => made.views[k].refused)))
+	await german.route(`**/v1/calibrations/${made.id}`, route => route.fulfill({ status: 412, contentType: 'application/problem+json', json: { type: 'urn:cbctd:problem:precondition-failed', title: 'Precondition failed', status: 412, detail: 'another has changed it' } }))
+	await german.click('button:has-text("Entfernen …")')
+	await german.click('dialog button.danger')
+	await until('a problem', () => german.textContent('dialog .trouble'), text => text === 'Inzwischen wurde dort etwas geändert: another has changed it')
+	expect((await english('dialog .trouble')).join() === 'another has changed it', 'what the daemon says of it is English')
+	await german.unroute(`**/v1/calibrations/${made.id}`)
+	await german.keyboard.press('Escape')
 	await german.click('.calibration summary:has-text("Als Tabelle")')
 	await german.waitForSelector('.calibration tbody tr')
 	for (const one of [page, german])

@@ -6,6 +6,7 @@ export class Problem extends Error {
 	constructor(status, document) {
 		super(problemText(document) || t('the daemon answered {status}', { status }))
 		this.status = status
+		this.document = problemText(document) ? document : null
 		this.pointer = document.pointer ?? null
 	}
 }

@@ -3,7 +3,7 @@ import { h, replace, write, throttle, timeElement, duration, number } from './do
 import { get, getPicture, request, calibrationPath, id } from './api.js'
 import { badge } from './state.js'
 import { list, warningList } from './facts.js'
-import { problemText } from './problems.js'
+import { problemText, problemNodes, errorNodes, inEnglish } from './problems.js'
 import { confirmed } from './form.js'
 import { upward } from './film.js'
 import { ViewPlot } from './views.js'
@@ -165,7 +165,7 @@ export class CalibrationPage {
 			const before = this.#calibration?.state
 			const calibration = this.#calibration = await get(calibrationPath(this.id), this.#abort.signal)
 			this.trouble.hidden = calibration.error === null
-			replace(this.trouble, calibration.error && problemText(calibration.error))
+			replace(this.trouble, calibration.error && problemNodes(calibration.error))
 			if (calibration.state !== before)
 				this.#show()
 		} catch (error) {
@@ -173,7 +173,7 @@ export class CalibrationPage {
 				return
 			if (error.status === 404)
 				write(this.heading, t('No such calibration'))
-			replace(this.trouble, error.status ? error.message : t('The daemon cannot be reached.'))
+			replace(this.trouble, error.status ? errorNodes(error) : t('The daemon cannot be reached.'))
 			this.trouble.hidden = false
 		}
 	}
@@ -200,7 +200,7 @@ export class CalibrationPage {
 				{ key: 'residual_isocentre_mm', name: t('at the isocentre, mm'), lines: [{ values: values('residual_isocentre_mm') }] },
 				{ key: 'balls', name: t('Balls'), lines: [{ values: values('balls') }] }] })
 		this.refusals.hidden = refused.length === 0
-		replace(this.refused, refused.map(k => h('li', {}, h('button', { type: 'button', class: 'quiet', onclick: () => this.#choose(k) }, t('Projection {n}', { n: k })), h('span', {}, views[k].refused ?? ''))))
+		replace(this.refused, refused.map(k => h('li', {}, h('button', { type: 'button', class: 'quiet', onclick: () => this.#choose(k) }, t('Projection {n}', { n: k })), inEnglish(views[k].refused ?? ''))))
 		this.#choose(this.#view)
 	}
 

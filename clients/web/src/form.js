@@ -5,6 +5,7 @@
 import { h, replace, newId, duration } from './dom.js'
 import { recipeText } from './state.js'
 import { request, newKey, Problem } from './api.js'
+import { errorNodes } from './problems.js'
 import { groups, members, presets, path, at } from './parameters.js'
 import { t } from './lang.js'
 
@@ -208,11 +209,11 @@ export class JobForm {
 		for (let part = pointer; part && !found; part = part.slice(0, part.lastIndexOf('/')))
 			found = this.#fields.get(part) ?? [...this.#fields].find(([name]) => name.startsWith(`${part}/`))?.[1] ?? null
 		if (!found) {
-			this.trouble.textContent = pointer ? `${pointer}: ${error.message}` : error.message
+			replace(this.trouble, pointer && `${pointer}: `, errorNodes(error))
 			this.trouble.hidden = false
 			return
 		}
-		replace(found.error, error.message)
+		replace(found.error, errorNodes(error))
 		found.error.hidden = false
 		found.input.setAttribute('aria-invalid', 'true')
 		found.input.setAttribute('aria-describedby', found.error.id)
@@ -263,7 +264,7 @@ export function confirmed(title, question, verb, act) {
 			await act()
 			dialog.close()
 		} catch (error) {
-			trouble.textContent = error.message
+			replace(trouble, errorNodes(error))
 			trouble.hidden = false
 			yes.disabled = false
 		}
@@ -279,7 +280,7 @@ export function pinButton({ pinned }, path, changed) {
 		try {
 			await request(pinned ? 'DELETE' : 'PUT', `${path}/pin`)
 		} catch (error) {
-			openDialog(t('It cannot be pinned'), h('p', {}, error.message))
+			openDialog(t('It cannot be pinned'), h('p', {}, errorNodes(error)))
 			button.disabled = false
 		}
 		changed()

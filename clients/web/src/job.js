@@ -17,7 +17,7 @@ import { Bar, badge, doing, left, ended, stateWord, volumeText } from './state.j
 import { geometryFacts, jobFacts, warningList } from './facts.js'
 import { nameOf } from './lists.js'
 import { reconstructAgain, confirmed, openDialog, pinButton } from './form.js'
-import { problemText } from './problems.js'
+import { problemNodes, errorNodes } from './problems.js'
 import { t } from './lang.js'
 
 const pollTime = 1500 /* ms: progress and time left are not told as events */
@@ -266,7 +266,7 @@ export class JobPage {
 			write(this.heading, t('No such job'))
 			this.progress.hidden = this.columns.hidden = true
 		}
-		replace(this.trouble, error.status ? error.message : t('The daemon cannot be reached; this page goes on by itself once it answers again.'))
+		replace(this.trouble, error.status ? errorNodes(error) : t('The daemon cannot be reached; this page goes on by itself once it answers again.'))
 		this.trouble.hidden = false
 	}
 
@@ -293,7 +293,7 @@ export class JobPage {
 		const warnings = [...scan.warnings, ...job.warnings]
 		replace(this.warnings, warningList(warnings))
 		this.warnings.hidden = warnings.length === 0
-		replace(this.failure, job.error ? h('div', { class: 'notice bad' }, t('It failed: {why}', { why: problemText(job.error) })) : null)
+		replace(this.failure, job.error ? h('div', { class: 'notice bad' }, t('It failed:'), ' ', problemNodes(job.error)) : null)
 		this.sendings.show(job)
 		this.refined.show(job)
 		replace(this.about, jobFacts(job))

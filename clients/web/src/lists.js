@@ -4,6 +4,7 @@ import { get, id, watch, volumePath } from './api.js'
 import { Bar, badge, doing, left, ended, recipeText, volumeText } from './state.js'
 import { reconstructAgain } from './form.js'
 import { groups, valueText } from './parameters.js'
+import { errorNodes } from './problems.js'
 import { t, t2, inSentence } from './lang.js'
 
 const pollTime = 2000 /* ms, while a job runs */
@@ -172,7 +173,7 @@ export class ListPage {
 		} catch (error) {
 			if (this.#closed)
 				return
-			replace(this.trouble, error.status ? error.message : t('The daemon cannot be reached; this page goes on by itself once it answers again.'))
+			replace(this.trouble, error.status ? errorNodes(error) : t('The daemon cannot be reached; this page goes on by itself once it answers again.'))
 			this.trouble.hidden = false
 		}
 	}

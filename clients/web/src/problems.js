@@ -2,6 +2,7 @@
  * What went wrong, in the page's words: a sentence for each type of problem that the daemon has (daemon/problem.c). What it
  * says beside that, with the numbers, is English; in another language it stands behind the sentence.
  */
+import { h } from './dom.js'
 import { language, t } from './lang.js'
 
 const sentences = () => ({
@@ -45,3 +46,15 @@ export function problemText({ type, detail, title }) {
 	const sentence = sentences()[type?.split(':').at(-1)] ?? title
 	return !detail || !sentence ? detail || sentence || '' : language() === 'en' ? detail : `${sentence}: ${detail}`
 }
+
+/* What the daemon says, marked as English, so that it is read out as such amid another language. */
+export const inEnglish = text => h('span', { lang: 'en' }, text)
+
+/* The same words as nodes. */
+export function problemNodes(document) {
+	const text = problemText(document), detail = document.detail ?? ''
+	return detail && text.endsWith(detail) ? [text.slice(0, -detail.length), inEnglish(detail)] : [text]
+}
+
+/* What an error says: a problem as above, the page's own words as they are. */
+export const errorNodes = error => error.document ? problemNodes(error.document) : [error.message]

@@ -1,6 +1,7 @@
 /* The interface as a page to read: what the daemon serves as /v1/openapi.json, by subject, with examples and schemas. */
 import { h, replace } from './dom.js'
 import { get } from './api.js'
+import { errorNodes } from './problems.js'
 import { t } from './lang.js'
 
 const methods = ['get', 'put', 'post', 'delete']
@@ -27,7 +28,7 @@ export class ReferencePage {
 			this.#document = await get('/v1/openapi.json', this.#abort.signal)
 		} catch (error) {
 			if (!this.#abort.signal.aborted)
-				replace(this.content, h('div', { class: 'notice bad', role: 'alert' }, error.message))
+				replace(this.content, h('div', { class: 'notice bad', role: 'alert' }, errorNodes(error)))
 			return
 		}
 		this.#show()

@@ -5,6 +5,7 @@ import { Film } from './film.js'
 import { nameOf } from './lists.js'
 import { geometryFacts, warningList } from './facts.js'
 import { reconstructAgain, confirmed, pinButton } from './form.js'
+import { errorNodes } from './problems.js'
 import { t } from './lang.js'
 
 const pollTime = 1500 /* ms, while projections arrive */
@@ -58,7 +59,7 @@ export class ScanPage {
 				return
 			if (error.status === 404)
 				write(this.heading, t('No such scan'))
-			replace(this.trouble, error.status ? error.message : t('The daemon cannot be reached.'))
+			replace(this.trouble, error.status ? errorNodes(error) : t('The daemon cannot be reached.'))
 			this.trouble.hidden = false
 		}
 	}

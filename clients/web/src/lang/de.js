@@ -84,7 +84,7 @@ export const strings = {
 	'In the queue': 'In der Warteschlange',
 	'Interface': 'Schnittstelle',
 	'It cannot be pinned': 'Anheften nicht möglich',
-	'It failed: {why}': 'Fehlgeschlagen: {why}',
+	'It failed:': 'Fehlgeschlagen:',
 	'It is kept whatever its age': 'Wird unabhängig vom Alter behalten',
 	'Iteration': 'Iteration',
 	'Iteration {n}: residual {residual}, change {change}, TV {tv}, {time}': 'Iteration {n}: Residuum {residual}, Änderung {change}, TV {tv}, {time}',
