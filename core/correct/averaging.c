@@ -283,16 +283,20 @@ double averaging_ratio(double pixels, const struct averaging_sums sums[AVERAGING
 
 double averaging_own_ratio(double pixels, const struct averaging_sums sums[AVERAGING_DISTANCES], double noise2)
 {
-	/* Noise is known within a quarter. */
-	static const double little = 0.3;
+	/*
+	 * Noise is told as that of thick parts, up to twice what all pixels have; of white noise a second difference
+	 * has six times the variance. A mean that was not needed costs less than one that is not taken.
+	 */
+	static const double little = 0.3, sure = 0.5;
 	double values[AVERAGING_DISTANCES], half, whole;
 	int distances[AVERAGING_DISTANCES];
 
 	averaging_distances(pixels, distances);
 	for (int i = 0; i < AVERAGING_DISTANCES; i++) {
-		/* Of white noise a second difference has six times the variance. */
-		values[i] = mean(&sums[i].own) - 6 * noise2;
-		if (!(6 * noise2 < little * values[i]))
+		const double own = mean(&sums[i].own), added = 6 * noise2;
+
+		values[i] = own - sure * added;
+		if (!(added < little * (own - added)))
 			return 0;
 	}
 	half = along_power_law(fmax(1, pixels / 2), distances[0], values);

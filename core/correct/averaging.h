@@ -123,7 +123,7 @@ void shells_distances(double pixels, int ret_distances[SHELL_DISTANCES]);
 double shells_share(double pixels, const struct averaging_sums sums[SHELL_DISTANCES]);
 /*
  * The same where neighbouring rows say little: outlines that are tilted everywhere, as a ball's. From each row with
- * itself, less what noise of this variance adds; 0 where that is not little.
+ * itself, less half of what noise of this variance adds, so that it is rather too large; 0 where that is not little.
  */
 double averaging_own_ratio(double pixels, const struct averaging_sums sums[AVERAGING_DISTANCES], double noise2);
 /* Share of a voxel's width, 0 .. 1, over which the mean goes. */
