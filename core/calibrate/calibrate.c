@@ -46,7 +46,6 @@ static int find_in_view(const struct run *run, struct shadow_finder *finder, flo
 	if (work->shadows == NULL)
 		return error_set(err, ERR_NO_MEMORY, "no memory for %d shadows", work->count);
 	memcpy(work->shadows, list, (size_t)work->count * sizeof(*list));
-	run->calibration->views[view].shadows = work->count;
 	return 0;
 }
 
@@ -83,7 +82,7 @@ static int find_all(struct run *run, struct error *err)
 		free(image);
 		free(list);
 	}
-	return failed;
+	return failed < 0 ? failed : blur_measure(run, &scale, err);
 }
 
 /* Tells pictures of which no view has enough shadows, and pictures that are none of line integrals. */
@@ -437,9 +436,19 @@ static void prepare_matches(struct run *run)
 		run->matches[k] = (struct match_view){.shadows = run->works[k].shadows,
 						      .count = run->works[k].count,
 						      .columns = nominal->columns,
-						      .rows = nominal->rows};
+						      .rows = nominal->rows,
+						      .blur = run->blur};
 		pose_of_view(&run->matches[k].nominal, &nominal->views[k]);
 	}
+}
+
+/* Of balls that are blurred any reason may be for that. */
+static void tell_blur(double blur, struct error *err)
+{
+	const struct error why = *err;
+
+	snprintf(err->text, sizeof(err->text), "the balls look blurred by about %.1f pixels (sigma): %.260s", blur,
+		 why.text);
 }
 
 int calibrate(struct calibration *ret_calibration, const struct calibrate_request *request, struct error *err)
@@ -474,6 +483,8 @@ int calibrate(struct calibration *ret_calibration, const struct calibrate_reques
 	if (code == 0)
 		code = sweep_fill(&calibration, request->nominal, err);
 	run_close(&run);
+	if (code == ERR_IMPOSSIBLE && run.blur > 0)
+		tell_blur(run.blur, err);
 	if (code < 0)
 		calibration_clear(&calibration);
 	else

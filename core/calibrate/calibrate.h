@@ -10,6 +10,7 @@
  * Where source and detector of an arm stood in each view of a sweep, from the shadows of balls whose places are known.
  *
  *   shadows.c  background, candidates, and for each the centroid of its shadow            (an image -> shadows)
+ *   blur.c     whether a detector blurs them
  *   match.c    which shadow is of which ball: votes with the nominal geometry             (shadows -> pairs)
  *   resect.c   a view from its pairs: RANSAC over the normalised DLT                      (pairs -> a first pose)
  *   pose.c     a view's nine numbers by Levenberg-Marquardt                               (pairs -> pose)

@@ -13,11 +13,14 @@ static const double MEDIAN_TO_SIGMA = 1.4826;
 static const double MADE = .005; /* of a ball's diameter: how it was made, and what hardening makes of its edges */
 /* Square pixels of R^2 that a detector's blur of another shape than the fit's may add or take. */
 static const double BLUR_UNKNOWN = .05;
+/* Of the blur's variance: what a fit of balls that are hardly wider takes for the ball's or leaves there. */
+static const double BLUR_SHARE = .25;
 
 /* Sums and lists over shadows. */
 struct taken {
 	int count, noisy;            /* shadows; those whose noise is known */
 	double variances, curvature; /* sums of sigma^2 and of 1 / R^2 */
+	double blurs;                /* sum of the blur's variance over R^2 */
 	float *ratios, *scratch;     /* [views * balls] */
 };
 
@@ -33,6 +36,7 @@ static void take_pairs(const struct run *run, int view, const struct pair *pairs
 
 		taken->ratios[taken->count++] = (float)(pairs[i].radius / expected);
 		taken->curvature += 1 / (expected * expected);
+		taken->blurs += fitted ? pairs[i].blur * pairs[i].blur / (expected * expected) : 0;
 		taken->noisy += fitted;
 		taken->variances += fitted ? pairs[i].sigma * pairs[i].sigma : 0;
 	}
@@ -64,7 +68,9 @@ static struct diameters summed_up(struct taken *taken)
 		taken->scratch[i] = fabsf(taken->ratios[i] - (float)ratio);
 	spread = MEDIAN_TO_SIGMA * select_kth(taken->scratch, count, count / 2);
 	return (struct diameters){.ratio = ratio,
-				  .error = MADE + BLUR_UNKNOWN * taken->curvature / count + 2 * spread / sqrt(count),
+				  .error = MADE +
+					   (BLUR_UNKNOWN * taken->curvature + BLUR_SHARE * taken->blurs) / count +
+					   2 * spread / sqrt(count),
 				  .noise = sqrt(2 * taken->variances / fmax(1, taken->noisy))};
 }
 

@@ -23,11 +23,15 @@ void balls_extent(const struct balls *balls, double ret_extent[3]);
 const char *balls_flat(const double extent[3]);
 
 /* ---- shadows.c ---- */
+/* What a ball's shadow looks like: its chords, or, where a detector blurs them, a bell. */
+enum shape { SHAPE_CHORDS, SHAPE_BELL, SHAPES };
+
 struct shadow {
 	double column, row; /* pixels: centroid of the line integrals above the background */
 	double radius;      /* pixels, of the ball that has this second moment */
 	double height;      /* at the centre, line integral above the background */
-	double likeness;    /* share of the variance that a ball's shadow explains */
+	double as[SHAPES];  /* share of the variance that a shape explains */
+	double likeness;    /* of these that of the scan's shape */
 };
 
 enum { SHADOWS_MOST = 768 };
@@ -48,9 +52,11 @@ struct shadow_facts {
 	int candidates;       /* bumps above the noise, of any shape */
 };
 
-/* Writes at most SHADOWS_MOST shadows that look like a ball's and returns how many, highest first. */
+/* Writes at most SHADOWS_MOST shadows that have either shape, each maybe twice, and returns how many, highest first. */
 int shadows_find(struct shadow_finder *finder, const float *image, struct shadow *ret_shadows,
 		 struct shadow_facts *ret_facts);
+/* Keeps those of a shape, each once; returns how many. */
+int shadows_keep(struct shadow *shadows, int count, enum shape shape);
 
 /* ---- pose.c ---- */
 struct pose {
@@ -75,6 +81,7 @@ struct pair {
 	int shadow;              /* its index in the view's list; -1: fitted together with others (touching.c) */
 	double pixel[2], radius; /* of its shadow */
 	double sigma;            /* pixels, of either coordinate, by the picture's noise; of a fitted one alone */
+	double blur;             /* pixels, standard deviation, beside a pixel's own side; of a fitted one alone */
 };
 
 /* Residuals' Jacobian of a ball in a view: by the pose's nine steps and by the ball's place. */
@@ -119,6 +126,7 @@ struct match_view {
 	int count;
 	struct pose nominal;
 	int columns, rows;
+	double blur; /* pixels, of run.blur */
 };
 
 /* Pairs of shadows and balls, the phantom turned about z by an angle; returns their number, at most balls->count. */
@@ -196,7 +204,15 @@ struct run {
 	struct match_view *matches; /* [views] */
 	struct motions motions;     /* of the drawing */
 	double least, most;         /* mm, the balls' diameters */
+	double blur;                /* pixels, standard deviation: of a detector that blurs the balls, about; else 0 */
 };
+
+/* ---- blur.c ---- */
+/*
+ * Keeps of each view's shadows those of the shape that the scan's have, `scale` the radii that are expected, and takes
+ * from their radii what the detector's blur adds. Writes run->blur.
+ */
+int blur_measure(struct run *run, const struct shadow_scale *scale, struct error *err);
 
 /* Pose and pairs of each view that can be used, the phantom turned about z by an angle; of the others the reason. */
 int find_views(struct run *run, double turn, struct error *err);

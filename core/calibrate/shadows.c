@@ -6,6 +6,7 @@
  * judged at full resolution, each by itself. There, a plane through a ring around the shadow is the background; the
  * centroid, the second moment and the height of what is above it are iterated to rest; and the share of the variance
  * that a ball's chord lengths, 2 sqrt(R^2 - d^2), explain tells a ball from a wire, a clip's edge or two balls in one.
+ * A detector that blurs leaves a bell of them: which of the two shapes the balls of a scan have, blur.c says.
  */
 #include <math.h>
 #include <stdbool.h>
@@ -357,23 +358,33 @@ static bool take_moments(const struct shadow_finder *finder, const float *image,
 	return m.mass > 0;
 }
 
-/* A ball's chord, 1 in its middle, as the pixel at dx, dy from there has it. */
-static double chord_of(double dx, double dy, double radius)
+/*
+ * A ball's chord, 1 in its middle, as the pixel at dx, dy from there has it; and a bell, (1 - d^2)^4 over a disc that
+ * is wider so that its second moment is the same: what is left of a chord where a detector blurs by a third of the
+ * radius and more.
+ */
+static void shapes_of(double dx, double dy, double radius, double ret_shapes[SHAPES])
 {
+	/* <rho^2> of (1 - d^2)^n over a disc is R^2 / (n + 2). */
+	static const double narrower = 2.5 / (4 + 2);
 	const int rays = radius < RADIUS_FINE ? RAYS : 1;
-	double sum = 0;
+	double chords = 0, bells = 0;
 
 	for (int i = 0; i < rays * rays; i++) {
 		const double x = dx + (i % rays + .5) / rays - .5, y = dy + (i / rays + .5) / rays - .5;
+		const double square = (x * x + y * y) / (radius * radius), bell = fmax(0, 1 - narrower * square);
 
-		sum += sqrt(fmax(0, 1 - (x * x + y * y) / (radius * radius)));
+		chords += sqrt(fmax(0, 1 - square));
+		bells += bell * bell * bell * bell;
 	}
-	return sum / (rays * rays);
+	ret_shapes[SHAPE_CHORDS] = chords / (rays * rays);
+	ret_shapes[SHAPE_BELL] = bells / (rays * rays);
 }
 
-/* Sums over a window of values, of a ball's chord lengths there (1 in the middle), and of what noise adds. */
+/* Sums over a window of values, of what each shape has there (1 in the middle), and of what noise adds. */
 struct agreement {
-	double count, sum, squares, chords, both, noise;
+	double count, sum, squares, noise;
+	double shape[SHAPES], both[SHAPES];
 };
 
 static void take_agreement(const struct shadow_finder *finder, const float *image, const struct plane *plane,
@@ -385,38 +396,45 @@ static void take_agreement(const struct shadow_finder *finder, const float *imag
 	for (int y = (int)ceil(shadow->row - window); y <= shadow->row + window; y++)
 		for (int x = (int)ceil(shadow->column - window); x <= shadow->column + window; x++) {
 			const double dx = x - shadow->column, dy = y - shadow->row, square = dx * dx + dy * dy;
-			double value, chord;
+			double value, shapes[SHAPES];
 
 			if (square > window * window)
 				continue;
-			chord = chord_of(dx, dy, radius);
+			shapes_of(dx, dy, radius, shapes);
 			value = image[(size_t)y * (size_t)finder->columns + (size_t)x] - plane->at - plane->by_x * dx -
 				plane->by_y * dy;
 			sums.count++;
 			sums.sum += value;
 			sums.squares += value * value;
-			sums.chords += chord * chord;
-			sums.both += chord * value;
+			for (int i = 0; i < SHAPES; i++) {
+				sums.shape[i] += shapes[i] * shapes[i];
+				sums.both[i] += shapes[i] * value;
+			}
 			sums.noise += variance * (value > 0 ? exp(value < 8 ? value : 8) : 1);
 		}
 	*ret = sums;
 }
 
 /*
- * The share of the variance that a ball's chord lengths explain. Noise is none of what has to be explained: its
- * variance in a line integral grows with exp(p), as counts go down.
+ * The share of the variance that a shape explains. Noise is none of what has to be explained: its variance in a line
+ * integral grows with exp(p), as counts go down.
  */
 static void judge(const struct shadow_finder *finder, const float *image, const struct plane *plane,
 		  struct shadow *shadow)
 {
 	struct agreement sums;
-	double left, all;
+	double all;
 
 	take_agreement(finder, image, plane, shadow, &sums);
-	shadow->height = sums.both / sums.chords;
-	left = fmax(0, sums.squares - sums.both * shadow->height - sums.noise);
+	shadow->height = sums.both[SHAPE_CHORDS] / sums.shape[SHAPE_CHORDS];
 	all = sums.squares - sums.sum * sums.sum / sums.count - sums.noise;
-	shadow->likeness = all > .25 * (all + sums.noise) && shadow->height > 3 * plane->noise ? 1 - left / all : 0;
+	for (int i = 0; i < SHAPES; i++) {
+		const double left = fmax(0, sums.squares - sums.both[i] * sums.both[i] / sums.shape[i] - sums.noise);
+
+		shadow->as[i] =
+		    all > .25 * (all + sums.noise) && shadow->height > 3 * plane->noise ? 1 - left / all : 0;
+	}
+	shadow->likeness = shadow->as[SHAPE_CHORDS];
 }
 
 /* Lets centre and radius come to rest, beginning with a radius; false where no ball can be. */
@@ -471,7 +489,7 @@ static bool find_shadow(struct shadow_finder *finder, const float *image, const 
 			best = shadow;
 	}
 	*ret_shadow = best;
-	return best.likeness >= LIKENESS_LEAST;
+	return fmax(best.as[SHAPE_CHORDS], best.as[SHAPE_BELL]) >= LIKENESS_LEAST;
 }
 
 int shadows_find(struct shadow_finder *finder, const float *image, struct shadow *ret_shadows,
@@ -492,16 +510,29 @@ int shadows_find(struct shadow_finder *finder, const float *image, struct shadow
 	facts.candidates = bumps;
 	for (int i = 0; i < bumps; i++) {
 		struct shadow shadow;
-		bool known = false;
 
-		if (!find_shadow(finder, image, &finder->bumps[i], &shadow))
-			continue;
-		for (int j = 0; j < count && !known; j++)
-			known = hypot(shadow.column - ret_shadows[j].column, shadow.row - ret_shadows[j].row) <
-				.5 * shadow.radius;
-		if (!known)
+		if (find_shadow(finder, image, &finder->bumps[i], &shadow))
 			ret_shadows[count++] = shadow;
 	}
 	*ret_facts = facts;
 	return count;
+}
+
+int shadows_keep(struct shadow *shadows, int count, enum shape shape)
+{
+	int kept = 0;
+
+	for (int i = 0; i < count; i++) {
+		const struct shadow *shadow = &shadows[i];
+		bool known = shadow->as[shape] < LIKENESS_LEAST;
+
+		for (int j = 0; j < kept && !known; j++)
+			known = hypot(shadow->column - shadows[j].column, shadow->row - shadows[j].row) <
+				.5 * shadow->radius;
+		if (known)
+			continue;
+		shadows[kept] = *shadow;
+		shadows[kept++].likeness = shadow->as[shape];
+	}
+	return kept;
 }

@@ -6,10 +6,11 @@
  *
  *   p = background - log mean exp(-mu sum of chords).
  *
- * The unknowns are the places of the ball and of those that touch it, their mu, a factor of their radii, the side of
- * the square that a pixel's rays come from (the detector's blur, in pixels; 0 is a single ray), and a background of
- * second order. Balls that touch those beside it only are where the pose has them. The unknowns' covariance says which
- * places the picture determines: of two balls behind each other, none along the line between them.
+ * The unknowns are the places of the ball and of those that touch it, their mu, a factor of their radii, how wide a
+ * pixel's rays come from (a square of so many pixels to a side; of more than one the pixel's own and a Gaussian blur of
+ * the detector's that have the square's variance; 0 is a single ray), and a background of second order. Balls that
+ * touch those beside it only are where the pose has them. The unknowns' covariance says which places the picture
+ * determines: of two balls behind each other, none along the line between them.
  */
 #include <math.h>
 #include <stdbool.h>
@@ -20,17 +21,26 @@
 #include "core/select.h"
 
 enum { MEMBERS_MOST = 8, FIXED_MOST = 24, PIXELS_MOST = 4096, STEPS_MOST = 12 };
-enum { SIDE_FINE = 4, SIDE_COARSE = 2, RAYS_MOST = SIDE_FINE * SIDE_FINE }; /* rays along a pixel's side */
+/* Rays along a pixel's side. */
+enum { SIDE_FINE = 4, SIDE_COARSE = 2, SIDE_BLURRED = 8, RAYS_MOST = SIDE_BLURRED * SIDE_BLURRED };
 enum { BEHIND = 0, DENSITY = 6, FACTOR, BLUR, PLACES, UNKNOWNS_MOST = PLACES + 2 * MEMBERS_MOST };
 static const double RADIUS_FINE = 4;    /* pixels: shadows of a smaller radius have the more rays */
 static const double MARGIN = 2;         /* pixels, around a ball, in which another's shadow disturbs */
 static const double FACTOR_SIGMA = .05; /* what is expected of the radii's factor about 1, where pixels say little */
-static const double BLUR_SIGMA = .5;    /* the same of the blur about one pixel */
+static const double BLUR_SIGMA = .5;    /* the same of the rays' width, of what the scan's blur makes it */
 static const double STEP = .02;         /* of a difference that stands for a derivative: pixels, or of a factor */
 static const double STEP_LEAST = 1e-3;  /* pixels, by which places move when the fit has come to rest */
+static const double REACH = 2.5;        /* standard deviations of the blur, over which rays come from */
+static const double BLUR_LEAST = .05;   /* pixels; of none a weight cannot be told */
 static const double DARKEST = 8;        /* a line integral from which on pixels weigh alike, next to nothing */
 static const double LIKENESS_LEAST = .85;
 static const double SIGMA_MOST = .25; /* pixels */
+
+/* Where the rays of a pixel stand along either side, pixels, and what they weigh. */
+struct rays {
+	int side;
+	double at[SIDE_BLURRED], weight[SIDE_BLURRED];
+};
 
 /* A ball's shadow as the pose has it. */
 struct disc {
@@ -42,6 +52,8 @@ struct disc {
 struct crowd {
 	const float *image;
 	int columns, rows, side;
+	double blur;               /* of the detector, about; pixels */
+	struct rays rays, further; /* of the unknown width, and of STEP more */
 	struct disc members[MEMBERS_MOST], fixed[FIXED_MOST];
 	int count, fixed_count; /* members[0] is the ball that is asked for */
 	double reach;           /* pixels around it that tell its background */
@@ -65,19 +77,57 @@ static double distance(const double a[2], const double b[2])
 	return hypot(a[0] - b[0], a[1] - b[1]);
 }
 
-/* Adds a disc's chords, in mm, at the rays of a pixel; false where none of them meets it. */
-static bool add_chords(const struct crowd *crowd, const struct disc *disc, double factor, double blur,
-		       const int pixel[2], double *chords)
+/* Square and Gaussian that have the variance of a square of this width: the Gaussian's standard deviation. */
+static double blur_of(double width)
 {
-	const int side = crowd->side;
+	return width > 1 ? sqrt((width * width - 1) / 12) : 0;
+}
+
+static double width_of(double blur)
+{
+	return sqrt(1 + 12 * blur * blur);
+}
+
+/*
+ * The rays of a width: of a pixel's square alone as of any other, equal steps of it. With a detector's blur beside they
+ * are the finer, and weigh as much as square and Gaussian have there.
+ */
+static struct rays rays_of(int side, double width)
+{
+	const double blur = fmax(BLUR_LEAST, blur_of(width)), reach = .5 + REACH * blur;
+	struct rays rays = {.side = side};
+	double sum = 0, squares = 0, wider;
+
+	for (int i = 0; i < side; i++) {
+		const double share = (i + .5) / side - .5, at = 2 * reach * share;
+
+		rays.at[i] = side == SIDE_BLURRED ? at : width * share;
+		rays.weight[i] =
+		    side == SIDE_BLURRED ? erf((at + .5) / (M_SQRT2 * blur)) - erf((at - .5) / (M_SQRT2 * blur)) : 1;
+		sum += rays.weight[i];
+		squares += rays.weight[i] * rays.at[i] * rays.at[i];
+	}
+	/* So few have another variance than they stand for. */
+	wider = side == SIDE_BLURRED ? sqrt((1. / 12 + blur * blur) * sum / squares) : 1;
+	for (int i = 0; i < side; i++) {
+		rays.at[i] *= wider;
+		rays.weight[i] /= sum;
+	}
+	return rays;
+}
+
+/* Adds a disc's chords, in mm, at the rays of a pixel; false where none of them meets it. */
+static bool add_chords(const struct rays *rays, const struct disc *disc, double factor, const int pixel[2],
+		       double *chords)
+{
+	const int side = rays->side;
 	const double dx = pixel[0] - disc->place[0], dy = pixel[1] - disc->place[1], radius = factor * disc->radius;
-	const double out = radius + .75 * fabs(blur);
+	const double out = radius + 1.5 * fabs(rays->at[0]);
 
 	if (dx * dx + dy * dy > out * out)
 		return false;
 	for (int i = 0; i < side * side; i++) {
-		const double x = dx + blur * ((i % side + .5) / side - .5);
-		const double y = dy + blur * ((i / side + .5) / side - .5);
+		const double x = dx + rays->at[i % side], y = dy + rays->at[i / side];
 		const double square = 1 - (x * x + y * y) / (radius * radius);
 
 		chords[i] += square > 0 ? disc->diameter * sqrt(square) : 0;
@@ -85,15 +135,19 @@ static bool add_chords(const struct crowd *crowd, const struct disc *disc, doubl
 	return true;
 }
 
-/* The line integral of a pixel that has the mean of its rays' intensities. */
-static double integral_of(const struct crowd *crowd, const double *chords, double density)
+/* The line integral of a pixel that has the mean of its rays' intensities; and each ray's part of that mean. */
+static double integral_of(const struct rays *rays, const double *chords, double density, double *ret_parts)
 {
-	const int rays = crowd->side * crowd->side;
+	const int side = rays->side;
 	double sum = 0;
 
-	for (int i = 0; i < rays; i++)
-		sum += exp(-density * chords[i]);
-	return -log(sum / rays);
+	for (int i = 0; i < side * side; i++) {
+		ret_parts[i] = rays->weight[i % side] * rays->weight[i / side] * exp(-density * chords[i]);
+		sum += ret_parts[i];
+	}
+	for (int i = 0; i < side * side; i++)
+		ret_parts[i] /= sum;
+	return -log(sum);
 }
 
 static double behind(const struct crowd *crowd, const double *by)
@@ -114,43 +168,48 @@ static struct disc standing(const struct crowd *crowd, int member)
 	return disc;
 }
 
-/* What all shadows make of a pixel, with the radii's factor and the blur as they are given. */
-static double shadows_at(const struct crowd *crowd, double factor, double blur, const int pixel[2])
+/* What all shadows make of a pixel, with the radii's factor and the rays as they are given. */
+static double shadows_at(const struct crowd *crowd, double factor, const struct rays *rays, const int pixel[2])
 {
-	double chords[RAYS_MOST] = {0};
+	double chords[RAYS_MOST] = {0}, parts[RAYS_MOST];
 	bool any = false;
 
 	for (int i = 0; i < crowd->fixed_count; i++)
-		any = add_chords(crowd, &crowd->fixed[i], factor, blur, pixel, chords) || any;
+		any = add_chords(rays, &crowd->fixed[i], factor, pixel, chords) || any;
 	for (int i = 0; i < crowd->count; i++) {
 		const struct disc disc = standing(crowd, i);
 
-		any = add_chords(crowd, &disc, factor, blur, pixel, chords) || any;
+		any = add_chords(rays, &disc, factor, pixel, chords) || any;
 	}
-	return any ? integral_of(crowd, chords, crowd->x[DENSITY]) : 0;
+	return any ? integral_of(rays, chords, crowd->x[DENSITY], parts) : 0;
 }
 
-/* Derivatives of a pixel by a member's place; `chords` are all of the pixel's. */
-static void by_place(const struct crowd *crowd, int member, const int pixel[2], const double *chords, double ret_by[2])
+/* Derivatives of a pixel by a member's place: `parts` are its rays'. */
+static void by_place(const struct crowd *crowd, int member, const int pixel[2], const double *parts, double ret_by[2])
 {
-	const double factor = crowd->x[FACTOR], blur = crowd->x[BLUR];
+	const int count = crowd->rays.side * crowd->rays.side;
+	const double factor = crowd->x[FACTOR];
 	struct disc disc = standing(crowd, member);
 	double own[RAYS_MOST] = {0};
 
-	if (!add_chords(crowd, &disc, factor, blur, pixel, own))
+	if (!add_chords(&crowd->rays, &disc, factor, pixel, own))
 		return;
 	for (int a = 0; a < 2; a++) {
 		double values[2];
 
 		for (int to = 0; to < 2; to++) {
-			double moved[RAYS_MOST];
+			double moved[RAYS_MOST] = {0}, sum = 0;
 
-			for (int i = 0; i < crowd->side * crowd->side; i++)
-				moved[i] = chords[i] - own[i];
 			disc = standing(crowd, member);
 			disc.place[a] += to == 0 ? -STEP : STEP;
-			add_chords(crowd, &disc, factor, blur, pixel, moved);
-			values[to] = integral_of(crowd, moved, crowd->x[DENSITY]);
+			add_chords(&crowd->rays, &disc, factor, pixel, moved);
+			for (int i = 0; i < count; i++) {
+				const double thicker = moved[i] - own[i];
+
+				/* Few rays meet any one ball. */
+				sum += thicker == 0 ? parts[i] : parts[i] * exp(-crowd->x[DENSITY] * thicker);
+			}
+			values[to] = -log(sum);
 		}
 		ret_by[a] = (values[1] - values[0]) / (2 * STEP);
 	}
@@ -161,26 +220,27 @@ static double model_at(const struct crowd *crowd, const int pixel[2], double *re
 {
 	const double *x = crowd->x, density = x[DENSITY];
 	const double dx = pixel[0] - crowd->members[0].place[0], dy = pixel[1] - crowd->members[0].place[1];
-	double chords[RAYS_MOST] = {0}, value = 0;
+	double chords[RAYS_MOST] = {0}, parts[RAYS_MOST], value = 0;
 	bool any = false;
 
 	memset(ret_by, 0, (size_t)crowd->unknowns * sizeof(*ret_by));
 	memcpy(ret_by + BEHIND, (const double[]){1, dx, dy, dx * dx, dx * dy, dy * dy},
 	       (DENSITY - BEHIND) * sizeof(dx));
 	for (int i = 0; i < crowd->fixed_count; i++)
-		any = add_chords(crowd, &crowd->fixed[i], x[FACTOR], x[BLUR], pixel, chords) || any;
+		any = add_chords(&crowd->rays, &crowd->fixed[i], x[FACTOR], pixel, chords) || any;
 	for (int i = 0; i < crowd->count; i++) {
 		const struct disc disc = standing(crowd, i);
 
-		any = add_chords(crowd, &disc, x[FACTOR], x[BLUR], pixel, chords) || any;
+		any = add_chords(&crowd->rays, &disc, x[FACTOR], pixel, chords) || any;
 	}
 	if (any) {
-		value = integral_of(crowd, chords, density);
-		ret_by[DENSITY] = (integral_of(crowd, chords, density * (1 + STEP)) - value) / (density * STEP);
-		ret_by[FACTOR] = (shadows_at(crowd, x[FACTOR] + STEP, x[BLUR], pixel) - value) / STEP;
-		ret_by[BLUR] = (shadows_at(crowd, x[FACTOR], x[BLUR] + STEP, pixel) - value) / STEP;
+		value = integral_of(&crowd->rays, chords, density, parts);
+		for (int i = 0; i < crowd->rays.side * crowd->rays.side; i++)
+			ret_by[DENSITY] += parts[i] * chords[i];
+		ret_by[FACTOR] = (shadows_at(crowd, x[FACTOR] + STEP, &crowd->rays, pixel) - value) / STEP;
+		ret_by[BLUR] = (shadows_at(crowd, x[FACTOR], &crowd->further, pixel) - value) / STEP;
 		for (int i = 0; i < crowd->count; i++)
-			by_place(crowd, i, pixel, chords, ret_by + PLACES + 2 * i);
+			by_place(crowd, i, pixel, parts, ret_by + PLACES + 2 * i);
 	}
 	return value + behind(crowd, ret_by);
 }
@@ -250,10 +310,12 @@ static void take_pixel(const struct crowd *crowd, const int pixel[2], struct equ
 	}
 }
 
-static void equate(const struct crowd *crowd, struct equations *ret)
+static void equate(struct crowd *crowd, struct equations *ret)
 {
 	const struct frame frame = frame_of(crowd);
 
+	crowd->rays = rays_of(crowd->side, crowd->x[BLUR]);
+	crowd->further = rays_of(crowd->side, crowd->x[BLUR] + STEP);
 	memset(ret, 0, sizeof(*ret));
 	for (int row = frame.top; row <= frame.bottom; row++)
 		for (int column = frame.left; column <= frame.right; column++) {
@@ -270,6 +332,7 @@ static bool begin(struct crowd *crowd)
 	const struct frame frame = frame_of(crowd);
 	const struct disc *ball = &crowd->members[0];
 	const int middle[2] = {(int)lround(ball->place[0]), (int)lround(ball->place[1])};
+	const struct rays ray = rays_of(crowd->side, 0), rays = rays_of(crowd->side, width_of(crowd->blur));
 	float values[PIXELS_MOST];
 	double above, modelled;
 	int count = 0;
@@ -277,19 +340,20 @@ static bool begin(struct crowd *crowd)
 	memset(crowd->x, 0, sizeof(crowd->x));
 	for (int i = 0; i < crowd->count; i++)
 		memcpy(crowd->x + PLACES + 2 * i, crowd->members[i].place, sizeof(ball->place));
-	crowd->x[DENSITY] = crowd->x[FACTOR] = crowd->x[BLUR] = 1;
+	crowd->x[DENSITY] = crowd->x[FACTOR] = 1;
+	crowd->x[BLUR] = width_of(crowd->blur);
 	for (int row = frame.top; row <= frame.bottom; row++)
 		for (int column = frame.left; column <= frame.right && count < PIXELS_MOST; column++) {
 			const int pixel[2] = {column, row};
 
-			if (tells(crowd, pixel) && shadows_at(crowd, 1, 1, pixel) == 0)
+			if (tells(crowd, pixel) && shadows_at(crowd, 1, &rays, pixel) == 0)
 				values[count++] = value_at(crowd, pixel);
 		}
 	if (count <= DENSITY - BEHIND)
 		return false;
 	crowd->behind = crowd->x[BEHIND] = select_kth(values, count, count / 2);
 	above = value_at(crowd, middle) - crowd->behind;
-	modelled = shadows_at(crowd, 1, 0, middle);
+	modelled = shadows_at(crowd, 1, &ray, middle);
 	if (!(above > 0) || !(modelled > 0))
 		return false;
 	crowd->x[DENSITY] = above / modelled;
@@ -306,7 +370,9 @@ static double variance_of(const struct crowd *crowd, const struct equations *sum
 static int factorise(const struct crowd *crowd, const struct equations *sums, double damping, double *ret_factor,
 		     double *ret_step)
 {
-	const double variance = variance_of(crowd, sums), sigma[2] = {FACTOR_SIGMA, BLUR_SIGMA};
+	const double variance = variance_of(crowd, sums);
+	const double expected[2] = {1, width_of(crowd->blur)},
+		     sigma[2] = {FACTOR_SIGMA, BLUR_SIGMA * width_of(crowd->blur)};
 	const int n = crowd->unknowns;
 
 	memcpy(ret_factor, sums->normal, sizeof(sums->normal));
@@ -315,7 +381,7 @@ static int factorise(const struct crowd *crowd, const struct equations *sums, do
 		const double known = variance / (sigma[i] * sigma[i]);
 
 		ret_factor[(n + 1) * (FACTOR + i)] += known;
-		ret_step[FACTOR + i] += known * (1 - crowd->x[FACTOR + i]);
+		ret_step[FACTOR + i] += known * (expected[i] - crowd->x[FACTOR + i]);
 	}
 	for (int k = 0; k < n; k++)
 		ret_factor[(n + 1) * k] *= 1 + damping;
@@ -375,6 +441,7 @@ static bool settle(struct crowd *crowd, struct pair *ret_pair)
 	}
 	ret_pair->sigma = sqrt(variance);
 	ret_pair->radius = crowd->x[FACTOR] * crowd->members[0].radius;
+	ret_pair->blur = blur_of(crowd->x[BLUR]);
 	all = sums.own.squares - sums.own.sum * sums.own.sum / sums.own.weight;
 	return variance <= SIGMA_MOST * SIGMA_MOST && sums.own.left <= (1 - LIKENESS_LEAST) * all;
 }
@@ -383,15 +450,16 @@ static bool settle(struct crowd *crowd, struct pair *ret_pair)
 static bool gather(const struct disc *discs, int count, int ball, struct crowd *crowd)
 {
 	const struct disc *own = &discs[ball];
+	const double margin = MARGIN + 2 * crowd->blur;
 
 	crowd->members[0] = *own;
 	crowd->count = 1;
 	crowd->fixed_count = 0;
-	crowd->reach = own->radius + MARGIN + fmax(3, .6 * own->radius);
+	crowd->reach = own->radius + margin + fmax(3, .6 * own->radius);
 	for (int b = 0; b < count; b++) {
 		const double apart = b != ball && discs[b].radius > 0 ? distance(discs[b].place, own->place) : INFINITY;
 
-		if (apart > own->radius + discs[b].radius + MARGIN)
+		if (apart > own->radius + discs[b].radius + margin)
 			continue;
 		if (crowd->count == MEMBERS_MOST)
 			return false;
@@ -418,7 +486,7 @@ static bool gather(const struct disc *discs, int count, int ball, struct crowd *
 
 static bool on_picture(const struct match_view *view, const struct disc *disc)
 {
-	const double edge = disc->radius + MARGIN;
+	const double edge = disc->radius + MARGIN + view->blur;
 
 	return disc->radius > 0 && disc->place[0] >= edge && disc->place[1] >= edge &&
 	       disc->place[0] <= view->columns - 1 - edge && disc->place[1] <= view->rows - 1 - edge;
@@ -428,7 +496,7 @@ int touching_fit(const struct match_view *view, const float *image, const struct
 		 const struct balls *balls, struct pair *ret_pairs)
 {
 	struct disc discs[BALLS_MOST];
-	struct crowd crowd = {.image = image, .columns = view->columns, .rows = view->rows};
+	struct crowd crowd = {.image = image, .columns = view->columns, .rows = view->rows, .blur = view->blur};
 	int count = 0;
 
 	for (int b = 0; b < balls->count; b++) {
@@ -441,7 +509,7 @@ int touching_fit(const struct match_view *view, const float *image, const struct
 		pulse_beat();
 		if (!on_picture(view, &discs[b]) || !gather(discs, balls->count, b, &crowd))
 			continue;
-		crowd.side = discs[b].radius < RADIUS_FINE ? SIDE_FINE : SIDE_COARSE;
+		crowd.side = view->blur > 0 ? SIDE_BLURRED : discs[b].radius < RADIUS_FINE ? SIDE_FINE : SIDE_COARSE;
 		if (begin(&crowd) && settle(&crowd, &pair) &&
 		    distance(pair.pixel, discs[b].place) <= fmax(1, discs[b].radius))
 			ret_pairs[count++] = pair;

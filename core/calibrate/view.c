@@ -52,7 +52,7 @@ static int drop_overlaps(const struct run *run, const struct pose *pose, struct 
 		for (int b = 0; b < balls->count && clear; b++)
 			clear = b == own || radii[b] == 0 ||
 				hypot(places[b][0] - places[own][0], places[b][1] - places[own][1]) >
-				    radii[b] + radii[own] + CLEARANCE;
+				    radii[b] + radii[own] + CLEARANCE + 2 * run->blur;
 		if (clear)
 			pairs[kept++] = pairs[i];
 	}
@@ -494,9 +494,9 @@ static void refuse_open_view(const struct run *run, int view, double open, doubl
 
 /*
  * Refuses views whose shadows do not determine their poses. The noise is that of all views' residuals: what is left of
- * seven balls by nine numbers says little of it.
+ * seven balls by nine numbers says little of it. `flat`: views of balls in a plane are none, even where all are such.
  */
-static int refuse_open(const struct run *run, struct error *err)
+static int refuse_open(const struct run *run, bool flat, struct error *err)
 {
 	const int count = run->calibration->count;
 	float *scratch = malloc((size_t)count * sizeof(*scratch)), *open = malloc((size_t)count * sizeof(*open));
@@ -523,7 +523,10 @@ static int refuse_open(const struct run *run, struct error *err)
 		}
 	limit = used > 0 ? fmax(OPEN_MOST, OPEN_FACTOR * select_kth(scratch, used, used / 2)) : 0;
 	for (int k = 0; k < count; k++)
-		if (run->calibration->views[k].used && !(open[k] <= limit))
+		if (run->calibration->views[k].used &&
+		    (!(open[k] <= limit) ||
+		     (flat && !(open[k] <= OPEN_MOST) &&
+		      flat_pairs(run, run->works[k].pairs, run->works[k].pair_count)[0] != '\0')))
 			refuse_open_view(run, k, open[k], limit);
 	free(scratch);
 	free(open);
@@ -543,7 +546,7 @@ static int used_of(const struct calibration *calibration)
  */
 static int hold_views(struct run *run, double *turn, struct error *err)
 {
-	int code = refuse_open(run, err);
+	int code = refuse_open(run, false, err);
 
 	if (code == 0)
 		code = place_views(run, turn, err);
@@ -576,5 +579,8 @@ int find_views(struct run *run, double turn, struct error *err)
 	}
 	if (code == 0)
 		code = settle_round(run, err);
+	/* From another place, where the phantom looks the same, views may show less. */
+	if (code == 0)
+		code = refuse_open(run, true, err);
 	return code == 0 ? refuse_uneven(run, err) : code;
 }

@@ -281,6 +281,105 @@ START_TEST(shadows_that_touch_are_told_apart)
 END_TEST
 
 /*
+ * Balls of 4.7 pixels that let 9 % through, behind a detector that blurs by .8 and 1.3 pixels (standard deviation of a
+ * square). Their shadows are no chords any more: they are found all the same, all of them, and nothing is told. Where
+ * the drawing is wrong as well, the reason names the blur.
+ */
+static const struct {
+	const char *what;
+	double blur, density, distance;
+} blurred[] = {
+    {"a little", 2, .6, 1},
+    {"by half of a radius", 3.7, .6, 1},
+    {"of balls that let more through", 3.7, .3, 1},
+    {"and another drawing", 3.7, .6, 1.3},
+};
+
+START_TEST(balls_that_a_detector_blurs_are_found)
+{
+	struct arm_scene scene = {.arm = arm_sagging};
+	struct ball_circles drawn = circles;
+	struct balls balls, drawing;
+	struct calibration calibration;
+	struct error err = {0};
+	int code;
+
+	drawn.ball = 4;
+	ck_assert(balls_circles(&balls, &drawn, &err) == 0);
+	drawn.distance *= blurred[_i].distance;
+	ck_assert(balls_circles(&drawing, &drawn, &err) == 0);
+	scene.arm.columns = 200;
+	scene.arm.rows = 160;
+	scene.arm.pixel = 1.5;
+	scene.arm.count = 10;
+	scene.arm.step = 2 * M_PI / scene.arm.count;
+	scene.target = (struct target){
+	    .balls = &balls, .ball = blurred[_i].density, .photons = 20000, .blur = blurred[_i].blur, .rays = 3};
+	code = run(&scene, &drawing, false, &calibration, &err);
+	if (blurred[_i].distance == 1) {
+		ck_assert_msg(code == 0, "%s: %s", blurred[_i].what, err.text);
+		assert_found(blurred[_i].what, &scene.arm, &calibration, .1);
+		expect_doubts(blurred[_i].what, &calibration, false, false);
+		ck_assert_double_eq(calibration.rival_height, 0);
+		calibration_clear(&calibration);
+	} else {
+		ck_assert_int_eq(code, ERR_IMPOSSIBLE);
+		ck_assert_msg(strncmp(err.text, "the balls look blurred by about 1", 33) == 0, "%s", err.text);
+	}
+	balls_clear(&balls);
+	balls_clear(&drawing);
+}
+END_TEST
+
+/* The upper half of a picture is blurred, as if by something before it: of one circle of two no shadow has chords. */
+static int take_half_blurred(void *context, int view, float *ret_image, struct error *err)
+{
+	struct arm_scene scene = *(const struct arm_scene *)context;
+	const size_t half = (size_t)scene.arm.columns * (size_t)scene.arm.rows / 2;
+	float *sharp = malloc(2 * half * sizeof(*sharp));
+	int code;
+
+	ck_assert_ptr_nonnull(sharp);
+	code = arm_image(&scene, view, ret_image, err);
+	scene.target.blur = 0;
+	if (code == 0)
+		code = arm_image(&scene, view, sharp, err);
+	memcpy(ret_image + half, sharp + half, half * sizeof(*sharp));
+	free(sharp);
+	return code;
+}
+
+/* Views of one circle look the same a circle aside, where the other is beside the picture: none is used. */
+START_TEST(no_view_is_used_a_circle_aside)
+{
+	struct arm_scene scene = {.arm = arm_sagging};
+	struct ball_circles is = circles;
+	struct balls balls;
+	struct calibration calibration;
+	struct error err = {0};
+	int code;
+
+	is.ball = 4;
+	ck_assert(balls_circles(&balls, &is, &err) == 0);
+	scene.arm.columns = 254;
+	scene.arm.rows = 197;
+	scene.arm.pixel = 1.5;
+	scene.arm.count = 10;
+	scene.arm.sag = .1;
+	scene.arm.step = 2 * M_PI / scene.arm.count;
+	scene.target = (struct target){.balls = &balls, .ball = .6, .photons = 20000, .blur = 2.6, .rays = 3};
+	code = arm_calibrate(&scene.arm, take_half_blurred, &scene, &balls, false, &calibration, &err);
+	for (int k = 0; k < calibration.count && code == 0; k++)
+		ck_assert_msg(!calibration.views[k].used || arm_wrong(&scene.arm, k, &calibration.views[k].view) <= 1,
+			      "view %d is wrong by %.1f pixels", k,
+			      arm_wrong(&scene.arm, k, &calibration.views[k].view));
+	ck_assert_int_eq(code, ERR_IMPOSSIBLE);
+	ck_assert_msg(strstr(err.text, "the 12 balls that it shows lie nearly in a plane") != NULL, "%s", err.text);
+	balls_clear(&balls);
+}
+END_TEST
+
+/*
  * Drawings that are wrong by 2 %, of 8 balls a circle in 15 views. One of another scale leaves no residual, whatever it
  * is: the balls know of it where these are as drawn, the nominal distances always. One of another shape leaves a
  * residual.
@@ -873,6 +972,8 @@ Suite *calibrate_suite(void)
 	tcase_add_test(tests, the_centroid_of_an_ellipse_is_known);
 	tcase_add_test(tests, finds_views_that_see_half_of_the_balls);
 	tcase_add_loop_test(tests, shadows_that_touch_are_told_apart, 0, sizeof(coarse) / sizeof(*coarse));
+	tcase_add_loop_test(tests, balls_that_a_detector_blurs_are_found, 0, sizeof(blurred) / sizeof(*blurred));
+	tcase_add_test(tests, no_view_is_used_a_circle_aside);
 	tcase_add_loop_test(tests, a_drawing_that_is_wrong_by_two_percent_is_told, 0,
 			    sizeof(drawings) / sizeof(*drawings));
 	tcase_add_loop_test(tests, a_phantom_beside_the_axis_is_of_no_other_scale, 0, 2);
