@@ -303,6 +303,36 @@ int noise_of_slices(const float *slices, const int size[3], double mu_water, dou
 	return 0;
 }
 
+/* Parts of the contrast: less noise is believed; and what the bound leaves to streaks. Times the projections' noise. */
+static const double DOUBTFUL = 0.1, STREAKS = 0.01, TIMES = 2;
+
+bool noise_is_doubtful(const struct volume_noise *noise, const struct recipe *recipe, const struct orbit *orbit)
+{
+	double pixels[2];
+
+	averaging_pixels(orbit, &recipe->grid, pixels);
+	return pixels[0] > SETTLING_NONE && noise->sigma > DOUBTFUL * noise->contrast;
+}
+
+/*
+ * The mean over n views of filtered noise at the isocentre: pi^2 / (n p^2) times the power of the filter's response, p
+ * being the pixel there (Kak and Slaney, Principles of Computerized Tomographic Imaging, ch. 5). Of a displaced
+ * detector half of the views see the outer places.
+ */
+struct volume_noise noise_bounded(const struct volume_noise *noise, const struct orbit *orbit, double variance,
+				  const float *response, int length)
+{
+	const double views = orbit->displaced ? 0.5 * orbit->count : orbit->count;
+	struct volume_noise ret = *noise;
+	double power = 0, propagated;
+
+	for (int k = 0; k <= length / 2; k++)
+		power += (k == 0 || 2 * k == length ? 1 : 2) * (double)response[k] * (double)response[k] / length;
+	propagated = M_PI * sqrt(variance * power / views) / orbit->pixel_at_isocentre[0];
+	ret.sigma = fmin(ret.sigma, TIMES * propagated + STREAKS * ret.contrast);
+	return ret;
+}
+
 /*
  * How far medium TV moves a voxel: the balance with the least error beside the truth, or a weaker one where the error
  * hardly changes and small contrasts stay. From phantoms of heads, wrists, necks and abdomens (tests/bench/denoise.c,

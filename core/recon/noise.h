@@ -25,6 +25,16 @@ int noise_measure(const struct backend *backend, struct volume *volume, const st
 int noise_of_slices(const float *slices, const int size[3], double mu_water, double sharp,
 		    struct volume_noise *ret_noise, struct error *err);
 
+/*
+ * Where voxels span more than 1.2 pixels, bone as thin as they are is in most places of a small head, and looks like
+ * noise there. Noise of the projections, told beside the object, bounds it: true where so much was found beside the
+ * contrast that it is worth a look at them; and the noise with that bound, for projections whose noise has this
+ * variance and FDK whose filter has this response (filter.h, of a row of `length`).
+ */
+bool noise_is_doubtful(const struct volume_noise *noise, const struct recipe *recipe, const struct orbit *orbit);
+struct volume_noise noise_bounded(const struct volume_noise *noise, const struct orbit *orbit, double variance,
+				  const float *response, int length);
+
 enum noise_stage { NOISE_OF_FDK, NOISE_OF_SART };
 /*
  * The alpha of TV_PROXIMAL and TV_GENERALISED behind FDK or behind each SART iteration, in the recipe's gray levels and

@@ -113,6 +113,20 @@ static int keep(struct recon *recon, const char *name, const char *stage, struct
 
 /* ---- the run ---- */
 
+/* The projections are as they came: before iterations they are averaged, where they are at all. */
+static int bound_noise(struct recon *recon, struct error *err)
+{
+	const struct fdk_weights *weights = &recon->weights;
+	const int wide = weights->pad[0] + recon->geometry->columns + weights->pad[1];
+	struct projection_squares squares;
+	int code = noise_of_projections(recon->backend, recon->projections, recon->geometry, &squares, err);
+
+	if (code == 0 && squares.rays > 0)
+		recon->noise =
+		    noise_bounded(&recon->noise, &recon->orbit, squares.noise, weights->response, filter_length(wide));
+	return code;
+}
+
 /* The noise that TV is to take out: that of the FDK volume, or without FDK of the first iterate. */
 static int measure_noise(struct recon *recon, struct error *err)
 {
@@ -122,6 +136,11 @@ static int measure_noise(struct recon *recon, struct error *err)
 	averaging_pixels(&recon->orbit, &recon->recipe.grid, pixels);
 	code = noise_measure(recon->backend, recon->volume, &recon->recipe.grid, recon->recipe.mu_water,
 			     averaging_sharpness(fmin(pixels[0], pixels[1])), &recon->noise, err);
+	/* Streaks beside metal are in no ray's noise, and TV is to take them, too. */
+	if (code == 0 && recon->recipe.fdk.on && recon->recipe.algorithm != NULL &&
+	    recon->norms.maximum < RESTRAINT_METAL * recon->recipe.mu_water &&
+	    noise_is_doubtful(&recon->noise, &recon->recipe, &recon->orbit))
+		code = bound_noise(recon, err);
 	if (code < 0)
 		return code;
 	recon->noise_measured = true;

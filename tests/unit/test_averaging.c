@@ -287,22 +287,36 @@ START_TEST(iterations_of_a_skull_on_coarse_voxels_are_no_worse_than_fdk)
 END_TEST
 
 /*
- * A skull whose edges are tilted against the rows, in noise that its thick parts have: taken off whole from all pixels
- * it left less of half a voxel's differences than objects of voxels have, no mean was taken, and ten iterations had 105
- * HU where FDK has 49. Found from outside.
+ * Skulls whose edges are tilted against the rows. Noise that thick parts have, taken off whole from all pixels, left
+ * less of half a voxel's differences than objects of voxels have: no mean was taken, and ten iterations had 105 HU
+ * where FDK has 49. Bone as thin as a voxel, in most places of a small head, was taken for noise of 93 HU: 83 HU where
+ * FDK has 52. Found from outside.
  */
-START_TEST(a_skull_in_noise_is_not_taken_for_one_of_voxels)
+static const struct {
+	double axes[3], bone, density, pixels;
+	int across, slices;
+	double photons;
+} heads[] = {
+    {{72, 58, 44}, 5.9, 1.78, 2.15, 43, 25, 3e4},
+    {{72, 58, 44}, 5.9, 1.78, 2.15, 43, 25, 1e5},
+    {{55, 42, 39}, 6, 2.07, 2.28, 41, 11, 0},
+};
+START_TEST(a_skull_in_noise_is_not_taken_for_one_of_voxels_nor_its_bone_for_noise)
 {
-	static const double photons[] = {3e4, 1e5};
-	const double pixel = 3.6 * 620 / 1100, voxel = 2.15 * pixel, water = .0192;
+	const double pixel = 3.6 * 620 / 1100, voxel = heads[_i].pixels * pixel, water = .0192, thick = heads[_i].bone;
+	const double *axes = heads[_i].axes;
 	struct ellipsoid parts[] = {
-	    {SHAPE_ELLIPSOID, {72, 58, 44}, {2, -3, 1}, 20 * M_PI / 180, 1.78 * water},
-	    {SHAPE_ELLIPSOID, {66.1, 52.1, 38.1}, {2, -3, 1}, 20 * M_PI / 180, -.75 * water},
+	    {SHAPE_ELLIPSOID, {axes[0], axes[1], axes[2]}, {2, -3, 1}, 20 * M_PI / 180, heads[_i].density * water},
+	    {SHAPE_ELLIPSOID,
+	     {axes[0] - thick, axes[1] - thick, axes[2] - thick},
+	     {2, -3, 1},
+	     20 * M_PI / 180,
+	     (1.03 - heads[_i].density) * water},
 	};
 	const struct phantom skull = {2, parts};
 	const struct orbit_spec spec = {96, 64, 60, {620, 1100, {3.6, 3.6}, {0, 0}, {0, 0}}, 7, 6};
 	const struct orbit_spec finer = {192, 128, 60, {620, 1100, {1.8, 1.8}, {0, 0}, {0, 0}}, 7, 6};
-	const struct grid grid = grid_of(43, 43, 25, voxel, voxel, voxel);
+	const struct grid grid = grid_of(heads[_i].across, heads[_i].across, heads[_i].slices, voxel, voxel, voxel);
 	float *truth = malloc(sizeof(*truth) * grid_voxels(&grid));
 	struct recipe recipe = recipe_on(&grid);
 	struct outcome outcome = {.threads = 1};
@@ -320,7 +334,7 @@ START_TEST(a_skull_in_noise_is_not_taken_for_one_of_voxels)
 		for (int column = 0; column < finer.columns; column++)
 			scene.projections[row / 2 * spec.columns + column / 2] +=
 			    rays.projections[row * finer.columns + column] / 4;
-	add_noise(&scene, photons[_i]);
+	add_noise(&scene, heads[_i].photons);
 	recipe.fdk.on = true;
 	recipe.emit = emit;
 	recipe.emits = 1;
@@ -330,7 +344,7 @@ START_TEST(a_skull_in_noise_is_not_taken_for_one_of_voxels)
 	fdk = body_error(outcome_volume(&outcome, "fdk"), truth, grid_voxels(&grid));
 	last = body_error(outcome_volume(&outcome, "final"), truth, grid_voxels(&grid));
 	scene_clear(&rays);
-	ck_assert_msg(last < .95 * fdk, "%g photons: FDK %.1f HU, SART %.1f", photons[_i], fdk, last);
+	ck_assert_msg(last < fdk, "%g mm, %g photons: FDK %.1f HU, SART %.1f", axes[0], heads[_i].photons, fdk, last);
 	outcome_clear(&outcome);
 	scene_clear(&scene);
 	free(truth);
@@ -559,7 +573,8 @@ Suite *averaging_suite(void)
 	tcase_add_test(decision, without_structure_nothing_is_decided);
 	tcase_add_loop_test(decision, iterations_of_a_skull_on_coarse_voxels_are_no_worse_than_fdk, 0,
 			    sizeof(skulls) / sizeof(skulls[0]));
-	tcase_add_loop_test(edges, a_skull_in_noise_is_not_taken_for_one_of_voxels, 0, 2);
+	tcase_add_loop_test(edges, a_skull_in_noise_is_not_taken_for_one_of_voxels_nor_its_bone_for_noise, 0,
+			    sizeof(heads) / sizeof(heads[0]));
 	tcase_add_loop_test(edges, flat_bodies_on_the_automatic_grid_are_no_worse_than_fdk, 0, 5);
 	tcase_add_test(edges, fdk_s_blur_is_known_beside_a_voxel_s);
 	tcase_add_loop_test(edges, edges_that_fdk_shows_as_well_are_the_mean_of_both, 0, 2);
