@@ -442,6 +442,37 @@ static void prepare_matches(struct run *run)
 	}
 }
 
+/* Views and how the phantom stood; where that gives too few, of a phantom that leans. */
+static int find_sweep(struct run *run, double *turn, struct error *err)
+{
+	const struct calibrate_request *request = run->request;
+	struct calibration *calibration = run->calibration;
+	struct balls leaning = {0};
+	int explained = 0, code = match_turn(run->matches, calibration->count, request->pixel_mm, request->balls, turn,
+					     &explained, err);
+
+	run->stands = request->balls;
+	if (code == 0)
+		code = find_views(run, *turn, err);
+	if (code == 0)
+		code = sweep_refuse(calibration, request, err);
+	if (code < 0 || views_used(calibration) >= USED_LEAST * calibration->count)
+		return code;
+	code = lean_find(run, explained, &leaning, turn, err);
+	if (code < 0 || leaning.ball == NULL)
+		return code;
+	run->stands = &leaning;
+	for (int k = 0; k < calibration->count; k++)
+		calibration->views[k] = (struct calibrated_view){.view = request->nominal->views[k],
+								 .shadows = calibration->views[k].shadows};
+	code = find_views(run, *turn, err);
+	if (code == 0)
+		code = sweep_refuse(calibration, request, err);
+	run->stands = request->balls;
+	balls_clear(&leaning);
+	return code;
+}
+
 /* Of balls that are blurred any reason may be for that. */
 static void tell_blur(double blur, struct error *err)
 {
@@ -464,12 +495,8 @@ int calibrate(struct calibration *ret_calibration, const struct calibrate_reques
 		code = check_pictures(&run, err);
 	if (code == 0) {
 		prepare_matches(&run);
-		code = match_turn(run.matches, calibration.count, request->pixel_mm, request->balls, &turn, err);
+		code = find_sweep(&run, &turn, err);
 	}
-	if (code == 0)
-		code = find_views(&run, turn, err);
-	if (code == 0)
-		code = sweep_refuse(&calibration, request, err);
 	if (code == 0 && request->adjust_balls)
 		code = adjust_balls(&run, err);
 	if (code == 0) {

@@ -12,6 +12,7 @@
  *   shadows.c  background, candidates, and for each the centroid of its shadow            (an image -> shadows)
  *   blur.c     whether a detector blurs them
  *   match.c    which shadow is of which ball: votes with the nominal geometry             (shadows -> pairs)
+ *   lean.c     a phantom that leans
  *   resect.c   a view from its pairs: RANSAC over the normalised DLT                      (pairs -> a first pose)
  *   pose.c     a view's nine numbers by Levenberg-Marquardt                               (pairs -> pose)
  *   certainty.c  what a view's shadows leave open of its pose

@@ -16,7 +16,7 @@ static const double LEAP_MOST = 5 * M_PI / 180;     /* of a source, against the 
 /* Of a detector: balls near to a plane tell little of its turns, and less where one is not where it is drawn. */
 static const double TWIST_MOST = 45 * M_PI / 180;
 
-/* A view's pose as the arm has it: turned back by its nominal source's angle. */
+/* A view's pose as the arm has it: turned back by its nominal source's angle about the arm's axis. */
 struct stance {
 	struct pose pose;
 	int view, run; /* run: which the view goes on with */
@@ -129,9 +129,12 @@ int follow_refuse(struct calibration *calibration, const struct calibrate_reques
 	struct stance *stances = malloc((size_t)calibration->count * sizeof(*stances));
 	struct follow *runs = malloc((size_t)calibration->count * sizeof(*runs));
 	int count = 0, code = 0, first;
+	struct axis axis;
 
 	if (stations == NULL || stances == NULL || runs == NULL)
 		code = error_set(err, ERR_NO_MEMORY, "no memory for %d views", calibration->count);
+	if (code == 0)
+		code = axis_of(calibration, request->nominal, &axis, err);
 	first = code == 0 ? first_station(stations, calibration->count) : 0;
 	for (int n = 0; n < calibration->count && code == 0; n++) {
 		const int i = (first + n) % calibration->count, k = stations[i].view;
@@ -146,7 +149,7 @@ int follow_refuse(struct calibration *calibration, const struct calibrate_reques
 		pose_turn(&nominal, -turn); /* the phantom turned one way is the arm turned the other */
 		hold_nominal(&stances[count].pose, &nominal, view->refused, sizeof(view->refused));
 		view->used = view->refused[0] == '\0';
-		pose_turn(&stances[count].pose, -stations[i].angle);
+		pose_turn_about(&stances[count].pose, &axis, -stations[i].angle);
 		count += view->used;
 	}
 	if (code == 0 && count > 0)

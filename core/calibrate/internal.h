@@ -137,10 +137,10 @@ int match_pose(const struct match_view *view, const struct pose *pose, const dou
 	       const struct balls *balls, double reach, struct pair *ret_pairs);
 /*
  * The angle about z by which the phantom stood turned, to a few degrees: of those under which poses explain about as
- * many balls' shadows of some views as under any, the smallest.
+ * many balls' shadows of some views as under any, the smallest; and how many those are.
  */
 int match_turn(const struct match_view *views, int count, const double pixel_mm[2], const struct balls *balls,
-	       double *ret_turn, struct error *err);
+	       double *ret_turn, int *ret_explained, struct error *err);
 
 /* ---- touching.c ---- */
 /*
@@ -150,6 +150,14 @@ int match_turn(const struct match_view *views, int count, const double pixel_mm[
  */
 int touching_fit(const struct match_view *view, const float *image, const struct pose *pose, const double pixel_mm[2],
 		 const struct balls *balls, struct pair *ret_pairs);
+
+/* ---- lean.c ---- */
+/*
+ * How a phantom leans under which poses explain surely more of its shadows than so many, and the turn it has then:
+ * allocates ret_stands->ball, which is NULL where none does.
+ */
+struct run;
+int lean_find(const struct run *run, int upright, struct balls *ret_stands, double *ret_turn, struct error *err);
 
 /* ---- motions.c ---- */
 enum { MOTIONS_MOST = 48 };
@@ -203,6 +211,7 @@ struct run {
 	struct work *works;         /* [views] */
 	struct match_view *matches; /* [views] */
 	struct motions motions;     /* of the drawing */
+	const struct balls *stands; /* as the drawing, or leaning: where views begin from; borrowed */
 	double least, most;         /* mm, the balls' diameters */
 	double blur;                /* pixels, standard deviation: of a detector that blurs the balls, about; else 0 */
 };
@@ -218,6 +227,8 @@ int blur_measure(struct run *run, const struct shadow_scale *scale, struct error
 int find_views(struct run *run, double turn, struct error *err);
 /* Finds views anew that are used, each from a pose of `poses`, of which those with `moved` are. */
 int find_moved(const struct run *run, const struct pose *poses, const bool *moved, struct error *err);
+/* How many views are used. */
+int views_used(const struct calibration *calibration);
 /* Residuals of a view that has its pose and pairs. */
 void measure_view(const struct run *run, int view);
 

@@ -343,9 +343,9 @@ static int smallest_turn(const int found[TURN_STEPS], double share)
  * as any, those count of which poses explain the pairs.
  */
 static int explained_turn(const struct match_view *views, int count, int used, const double pixel_mm[2],
-			  const struct balls *balls, const int pairs[TURN_STEPS])
+			  const struct balls *balls, const int pairs[TURN_STEPS], int *ret_explained)
 {
-	int found[TURN_STEPS] = {0}, most = 0, any = 0;
+	int found[TURN_STEPS] = {0}, most = 0, any = 0, best;
 
 	for (int t = 0; t < TURN_STEPS; t++)
 		most = pairs[t] > most ? pairs[t] : most;
@@ -358,11 +358,13 @@ static int explained_turn(const struct match_view *views, int count, int used, c
 					      2 * M_PI * (t - TURN_STEPS / 2) / TURN_STEPS);
 		any += found[t];
 	}
-	return any > 0 ? smallest_turn(found, TURN_AS_GOOD) : climb(pairs, smallest_turn(pairs, TURN_LIKE_BEST));
+	best = any > 0 ? smallest_turn(found, TURN_AS_GOOD) : climb(pairs, smallest_turn(pairs, TURN_LIKE_BEST));
+	*ret_explained = found[best];
+	return best;
 }
 
 int match_turn(const struct match_view *views, int count, const double pixel_mm[2], const struct balls *balls,
-	       double *ret_turn, struct error *err)
+	       double *ret_turn, int *ret_explained, struct error *err)
 {
 	const int used = count < TURN_VIEWS ? count : TURN_VIEWS;
 	int pairs[TURN_STEPS] = {0}, best, failed = 0;
@@ -387,7 +389,7 @@ int match_turn(const struct match_view *views, int count, const double pixel_mm[
 	}
 	if (failed)
 		return error_set(err, ERR_NO_MEMORY, "no memory to match %d balls", balls->count);
-	best = explained_turn(views, count, used, pixel_mm, balls, pairs);
+	best = explained_turn(views, count, used, pixel_mm, balls, pairs, ret_explained);
 	*ret_turn = 2 * M_PI * (best - TURN_STEPS / 2) / TURN_STEPS;
 	return 0;
 }

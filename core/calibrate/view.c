@@ -151,7 +151,7 @@ static int pair_view(const struct run *run, int view, double turn, bool again, s
 	int count;
 
 	if (!again)
-		return match_view(&run->matches[view], pixel_mm, balls, turn, pairs);
+		return match_view(&run->matches[view], pixel_mm, run->stands, turn, pairs);
 	pose_of_view(&beside.nominal, &run->calibration->views[view].view);
 	count = match_pose(&beside, &beside.nominal, pixel_mm, balls, NEIGHBOUR_REACH / pixel_mm[0], pairs);
 	/* An arm that shakes has the whole constellation further away than that. */
@@ -533,7 +533,7 @@ static int refuse_open(const struct run *run, bool flat, struct error *err)
 	return 0;
 }
 
-static int used_of(const struct calibration *calibration)
+int views_used(const struct calibration *calibration)
 {
 	int used = 0;
 
@@ -569,8 +569,8 @@ int find_views(struct run *run, double turn, struct error *err)
 	if (code == 0)
 		code = refuse_uneven(run, err);
 	/* Each round may give other views neighbours that are nearer. */
-	for (int before = -1; code == 0 && used_of(calibration) > before;) {
-		before = used_of(calibration);
+	for (int before = -1; code == 0 && views_used(calibration) > before;) {
+		before = views_used(calibration);
 		code = sweep_fill(calibration, run->request->nominal, err);
 		if (code == 0)
 			code = find_round(run, ROUND_AGAIN, &(struct beginning){.turn = turn}, err);

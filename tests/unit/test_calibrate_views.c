@@ -436,6 +436,40 @@ START_TEST(a_phantom_may_stand_beside_the_axis_and_lean)
 }
 END_TEST
 
+/* Of a helix that leans by 14 degrees all views are found: to either side, wherever it is turned. */
+START_TEST(a_helix_that_leans_is_found)
+{
+	static const char code[] = "10001000100000000101";
+	enum { COUNT = sizeof(code) - 1 };
+	static const double shift[3] = {6, -4, 3};
+	bool large[COUNT];
+	struct ball_helix helix = {
+	    .balls = COUNT, .diameter = 100, .pitch = 60, .step = 25 * M_PI / 180, .ball = {3.2, 4.8}, .large = large};
+	struct arm_scene scene = {
+	    .arm = {.columns = 250, .rows = 200, .count = 16, .pixel = 1.5, .step = 2 * M_PI / 16, .sag = .5}};
+	struct balls balls, drawing;
+	struct calibration calibration;
+	struct error err = {0};
+
+	for (int b = 0; b < COUNT; b++)
+		large[b] = code[b] == '1';
+	ck_assert(balls_helix(&drawing, &helix, &err) == 0);
+	helix.first = _i * 1.3;
+	ck_assert(balls_helix(&balls, &helix, &err) == 0);
+	for (int b = 0; b < COUNT; b++)
+		tilt_and_shift(&balls.ball[b], (_i % 2 == 0 ? 14 : -14) * M_PI / 180, shift);
+	scene.target = (struct target){.balls = &balls, .ball = .5, .photons = 20000};
+	ck_assert_msg(arm_calibrate(&scene.arm, arm_image, &scene, &drawing, false, &calibration, &err) == 0, "%s",
+		      err.text);
+	ck_assert_int_eq(calibration.used, calibration.count);
+	ck_assert_double_le(calibration.rms, .1);
+	ck_assert_double_lt(fabs(remainder(calibration.turn - helix.first, 2 * M_PI)), .1);
+	calibration_clear(&calibration);
+	balls_clear(&balls);
+	balls_clear(&drawing);
+}
+END_TEST
+
 /*
  * Over a short arc the sources are all nearer to a phantom that stands beside the axis, or farther from it: that tells
  * nothing of its scale.
@@ -843,6 +877,7 @@ Suite *calibrate_views_suite(void)
 			    sizeof(flat) / sizeof(*flat));
 	tcase_add_test(tests, sources_about_no_axis_have_that_of_the_drawing);
 	tcase_add_test(tests, a_phantom_may_stand_beside_the_axis_and_lean);
+	tcase_add_loop_test(tests, a_helix_that_leans_is_found, 0, 4);
 	tcase_add_test(tests, a_phantom_beside_the_axis_of_a_short_arc_has_its_scale);
 	tcase_add_test(tests, a_pose_is_found_down_a_long_valley);
 	tcase_add_test(tests, a_phantom_of_many_balls_is_found_turned_as_it_stood);
