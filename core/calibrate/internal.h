@@ -250,7 +250,7 @@ void presence_count(struct run *run);
  * picture, and shadows that are of none.
  */
 int presence_unexplained(const struct run *run, int view, const struct pose *pose);
-/* Of these the shadows alone. */
+/* Of these the shadows alone, and those of another size than the ball has that is there. */
 int presence_strays(const struct run *run, int view, const struct pose *pose);
 
 /* ---- sweep.c ---- */

@@ -416,8 +416,9 @@ static int find_pace(struct placing *placing, struct error *err)
 
 /*
  * The place of a chain that does not go on with the longest one, one of the drawing's motions: nearest to the longest
- * one's last view before it, of those that leave fewest shadows without a ball. Only these tell: a ball that is not
- * seen may be behind something. -1 where they leave open how far along the axis it is; a panel jumps along, not around.
+ * one's last view before it, of those that leave fewest shadows without a ball of their size. Only these tell: a ball
+ * that is not seen may be behind something. -1 where they leave open how far along the axis it is; a panel jumps along,
+ * not around.
  */
 static int settle_apart(const struct placing *placing, int chain, int longest)
 {

@@ -167,10 +167,17 @@ int presence_unexplained(const struct run *run, int view, const struct pose *pos
 
 int presence_strays(const struct run *run, int view, const struct pose *pose)
 {
+	const double unlike = other_size(run);
 	struct places places;
+	struct clear clear;
+	int strays;
 
 	places_of(run, pose, &places);
-	return count_strays(run, view, &places);
+	clear_balls(run, view, &places, &clear);
+	strays = count_strays(run, view, &places);
+	for (int i = 0; i < clear.count; i++)
+		strays += fabsf(clear.size[i]) > unlike;
+	return strays;
 }
 
 void presence_count(struct run *run)

@@ -713,6 +713,47 @@ START_TEST(like_circles_are_told_apart_where_the_panel_jumps)
 }
 END_TEST
 
+/* Where the panel jumps, a helix' code tells each view's place: all are used. */
+START_TEST(a_code_tells_where_a_helix_stands_behind_a_jump)
+{
+	static const char code[] = "10001000100000000101";
+	enum { COUNT = sizeof(code) - 1 };
+	static const struct raised jump = {.rows = 160, .count = 14, .by = 14, .first = 4, .behind = 9};
+	bool large[COUNT];
+	const struct ball_helix helix = {
+	    .balls = COUNT, .diameter = 80, .pitch = 45, .step = 25 * M_PI / 180, .ball = {3.2, 4.8}, .large = large};
+	struct raised_scene of = {.scene.arm = {.columns = 200,
+						.rows = jump.rows + jump.by,
+						.count = jump.count,
+						.pixel = 1.1,
+						.step = 2 * M_PI / jump.count,
+						.sag = 1},
+				  .raised = &jump};
+	struct arm panel = of.scene.arm;
+	struct balls balls;
+	struct calibration calibration;
+	struct error err = {0};
+
+	panel.rows = jump.rows;
+	for (int b = 0; b < COUNT; b++)
+		large[b] = code[b] == '1';
+	ck_assert(balls_helix(&balls, &helix, &err) == 0);
+	of.scene.target = (struct target){.balls = &balls, .ball = .5, .photons = 20000};
+	ck_assert_msg(arm_calibrate(&panel, take_raised, &of, &balls, false, &calibration, &err) == 0, "%s", err.text);
+	for (int k = 0; k < calibration.count; k++) {
+		struct view *view = &calibration.views[k].view;
+
+		ck_assert_msg(calibration.views[k].used, "view %d: %s", k, calibration.views[k].refused);
+		for (int a = 0; a < 3; a++)
+			view->pixel0[a] -= lower_row(&jump, k) * view->row_step[a];
+		ck_assert_msg(arm_wrong(&of.scene.arm, k, view) <= .2, "view %d is wrong by %.1f pixels", k,
+			      arm_wrong(&of.scene.arm, k, view));
+	}
+	calibration_clear(&calibration);
+	balls_clear(&balls);
+}
+END_TEST
+
 /* A bar hides the highest of the circles in some views: only the balls of the others are there. */
 enum { FIRST_HIDDEN = 5, BEHIND_HIDDEN = 9 };
 static bool is_hidden(int view)
@@ -884,6 +925,7 @@ Suite *calibrate_views_suite(void)
 	tcase_add_loop_test(tests, of_like_circles_each_is_taken_for_itself, 0, sizeof(heights) / sizeof(*heights));
 	tcase_add_loop_test(tests, like_circles_are_told_apart_where_the_panel_jumps, 0,
 			    sizeof(raised) / sizeof(*raised));
+	tcase_add_test(tests, a_code_tells_where_a_helix_stands_behind_a_jump);
 	tcase_add_test(tests, a_circle_behind_a_bar_moves_no_view);
 	tcase_add_test(tests, a_helix_upside_down_is_refused);
 	tcase_add_test(tests, sizes_are_held_against_each_other);
