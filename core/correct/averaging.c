@@ -73,8 +73,8 @@ double averaging_sharpness(double pixels)
 
 double averaging_variance(double pixels, double ratio, double noise, double edges, double shells)
 {
-	/* Objects of voxels have ratios up to .137, what is blurred by tilted rows has .147 and more. */
-	static const double voxels = 0.137, body = 0.147;
+	/* Objects of voxels have ratios up to .137, what is blurred by tilted rows has .141 and more. */
+	static const double voxels = 0.137, body = 0.141;
 	static const double seen = 0.05, narrow = 0.09, wide = 0.15, narrow_to = 1.8, wide_from = WIDE_FROM;
 	const double told = ratio > 0 ? fmin(1, fmax(0, (ratio - voxels) / (body - voxels))) : 1;
 	const double fine = fmin(1, fmax(0, (wide_from - pixels) / (wide_from - TOLD_FROM)));
