@@ -91,12 +91,14 @@ static void add_view_warning(cJSON *warnings, const cJSON *result)
 	const int count = cJSON_GetArraySize(views), used = (int)number_of(result, "used");
 	const char *why = "";
 	const double pixels = number_of(result, "interpolated_pixels");
-	char detail[400], off[100] = "";
+	char detail[600], off[200] = "";
 
 	if (used == count)
 		return;
 	if (pixels > 0)
-		snprintf(off, sizeof(off), ", by %.2f pixels or %.2f mm at the isocentre off as the others tell",
+		snprintf(off, sizeof(off),
+			 ", by %.2f pixels or %.2f mm at the isocentre off where the arm moves as evenly as elsewhere, "
+			 "and by the jump where it jumps",
 			 pixels, number_of(result, "interpolated_isocentre_mm"));
 	cJSON_ArrayForEach(view, views)
 	{
