@@ -442,35 +442,49 @@ static void prepare_matches(struct run *run)
 	}
 }
 
-/* Views and how the phantom stood; where that gives too few, of a phantom that leans. */
+/* Views of a phantom that stands like this, begun from nothing. */
+static int find_standing(struct run *run, const struct balls *stands, double turn, struct error *err)
+{
+	struct calibration *calibration = run->calibration;
+	int code;
+
+	for (int k = 0; k < calibration->count; k++)
+		calibration->views[k] = (struct calibrated_view){.view = run->request->nominal->views[k],
+								 .shadows = calibration->views[k].shadows};
+	run->stands = stands;
+	code = find_views(run, turn, err);
+	if (code == 0)
+		code = sweep_refuse(calibration, run->request, err);
+	run->stands = run->request->balls;
+	return code;
+}
+
+/* Views and how the phantom stood; where that gives too few, of one that leans; and the reasons of the upright one
+ * where that does, too. */
 static int find_sweep(struct run *run, double *turn, struct error *err)
 {
 	const struct calibrate_request *request = run->request;
 	struct calibration *calibration = run->calibration;
+	const double enough = USED_LEAST * calibration->count;
 	struct balls leaning = {0};
+	double upright;
 	int explained = 0, code = match_turn(run->matches, calibration->count, request->pixel_mm, request->balls, turn,
 					     &explained, err);
 
-	run->stands = request->balls;
+	upright = *turn;
 	if (code == 0)
-		code = find_views(run, *turn, err);
-	if (code == 0)
-		code = sweep_refuse(calibration, request, err);
-	if (code < 0 || views_used(calibration) >= USED_LEAST * calibration->count)
+		code = find_standing(run, request->balls, *turn, err);
+	if (code < 0 || views_used(calibration) >= enough)
 		return code;
 	code = lean_find(run, explained, &leaning, turn, err);
 	if (code < 0 || leaning.ball == NULL)
 		return code;
-	run->stands = &leaning;
-	for (int k = 0; k < calibration->count; k++)
-		calibration->views[k] = (struct calibrated_view){.view = request->nominal->views[k],
-								 .shadows = calibration->views[k].shadows};
-	code = find_views(run, *turn, err);
-	if (code == 0)
-		code = sweep_refuse(calibration, request, err);
-	run->stands = request->balls;
+	code = find_standing(run, &leaning, *turn, err);
 	balls_clear(&leaning);
-	return code;
+	if (code < 0 || views_used(calibration) >= enough)
+		return code;
+	*turn = upright;
+	return find_standing(run, request->balls, upright, err);
 }
 
 /* Of balls that are blurred any reason may be for that. */
