@@ -173,7 +173,7 @@ held_behind() { # ITERATION: waits until the newest checkpoint is of a later one
 }
 
 test_a_job_goes_on_from_its_newest_checkpoint_however_often_it_is_killed() {
-	local recipe at=0 i many=100
+	local recipe at=0 i many=200
 	for recipe in '"sart": {"iterations": '$many', "subsets": "views"}, "tv": {"method": "gradient", "iterations": 1}' '"cgls": {"iterations": '$many'}'; do
 		at=0
 		start_daemon --checkpoint-seconds 0.05
