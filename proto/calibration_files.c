@@ -169,7 +169,7 @@ int calibration_run(const char *directory, const char *scan_directory, struct er
 static int read_views(const cJSON *result, struct calibrated *calibrated, struct error *err)
 {
 	const cJSON *geometry = cJSON_GetObjectItemCaseSensitive(result, "geometry"), *matrix;
-	const cJSON *list = cJSON_GetObjectItemCaseSensitive(geometry, "matrices");
+	const cJSON *list = cJSON_GetObjectItemCaseSensitive(geometry, "matrices"), *view;
 	const struct scan *sweep = calibrated->sweep;
 	const int count = cJSON_GetArraySize(list);
 	double *numbers;
@@ -185,6 +185,8 @@ static int read_views(const cJSON *result, struct calibrated *calibrated, struct
 		if (code == 0)
 			code = json_array(matrix, "/geometry/matrices", 12, -1e12, 1e12, numbers + 12 * index++, err);
 	}
+	cJSON_ArrayForEach(view, cJSON_GetObjectItemCaseSensitive(result, "views")) calibrated->between +=
+	    cJSON_IsFalse(cJSON_GetObjectItemCaseSensitive(view, "used"));
 	if (code == 0)
 		code = geometry_matrices(&calibrated->geometry, sweep->geometry.columns, sweep->geometry.rows, count,
 					 numbers, sweep->pixel_mm, err);
@@ -361,6 +363,27 @@ static void check_turn(const struct calibrated *calibrated, cJSON *notes)
 		     turn / degree);
 }
 
+/* Tells of places that no view had: other angles, and views that were not used. far: radians, of the angles. */
+static void tell_interpolated(const struct calibrated *calibrated, int count, double far, cJSON *notes)
+{
+	const double same = 1e-4 * degree; /* below what any encoder tells */
+	const int views = calibrated->geometry.count;
+	char refused[160] = "";
+
+	if (calibrated->between > 0)
+		snprintf(refused, sizeof(refused),
+			 "%d of the %d calibrated views were not used: their places are between their neighbours', off "
+			 "by the jump where the panel jumped",
+			 calibrated->between, views);
+	if (far > same)
+		note(notes, "calibration_interpolated",
+		     "%d views were calibrated, the scan has %d, up to %.2f degrees from the nearest of them: their "
+		     "places are interpolated by angle%s%s",
+		     views, count, far / degree, refused[0] != '\0' ? "; " : "", refused);
+	else if (refused[0] != '\0')
+		note(notes, "calibration_interpolated", "%s", refused);
+}
+
 /* How far the angles lie from calibrated ones at most, radians. */
 static double farthest(const struct geometry *sweep, const double *angles, int count)
 {
@@ -380,9 +403,7 @@ int calibrated_views(const struct calibrated *calibrated, const struct scan *sca
 		     struct geometry *ret_geometry, cJSON *ret_notes, struct error *err)
 {
 	const struct geometry *nominal = &calibrated->sweep->geometry;
-	const double same = 1e-4 * degree; /* below what any encoder tells */
 	struct geometry geometry = {0};
-	double far;
 	int code;
 
 	if (angles == NULL && scan->count != nominal->count)
@@ -399,15 +420,10 @@ int calibrated_views(const struct calibrated *calibrated, const struct scan *sca
 			 angles != NULL ? "/geometry/angles_deg" : "/geometry");
 		return code;
 	}
-	if (angles != NULL) {
-		far = farthest(nominal, angles, scan->count);
-		if (far > same)
-			note(ret_notes, "calibration_interpolated",
-			     "%d views were calibrated, the scan has %d, up to %.2f degrees from the nearest of them: "
-			     "their places are interpolated by angle",
-			     nominal->count, scan->count, far / degree);
+	tell_interpolated(calibrated, scan->count, angles != NULL ? farthest(nominal, angles, scan->count) : 0,
+			  ret_notes);
+	if (angles != NULL)
 		check_direction(calibrated, angles, scan->count, ret_notes);
-	}
 	check_turn(calibrated, ret_notes);
 	fit_detector(calibrated, scan, &geometry, ret_notes);
 	*ret_geometry = geometry;

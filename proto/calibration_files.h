@@ -42,6 +42,7 @@ struct calibrated {
 	struct scan *sweep; /* the scan of the phantom: nominal geometry, detector */
 	double acquired;    /* when that scan was made, seconds since 1970 */
 	struct geometry geometry;
+	int between;        /* views that were not used: they have places between their neighbours' */
 	struct balls balls; /* none: a job has refined it, and there was no phantom */
 };
 int calibrated_read(const cJSON *request, const cJSON *result, struct calibrated *ret, struct error *err);

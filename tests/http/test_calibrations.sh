@@ -550,4 +550,27 @@ test_cbct_and_python_calibrate() {
 	stop_daemon
 }
 
+# A view of a panel that jumped has a place between its neighbours', and the scans that use it are told, too.
+test_a_view_that_is_not_used_is_told_of_the_calibration_and_of_its_scans() {
+	local bytes
+	start_daemon
+	balls
+	bytes=$(($(stat -c %s "$work/balls/projections.raw") / 24))
+	dd if="$work/balls/projections.raw" of="$work/view" bs=$bytes skip=5 count=1 status=none
+	# forty columns further on
+	(tail -c 80 "$work/view" && head -c -80 "$work/view") >"$work/jumped"
+	dd if="$work/jumped" of="$work/balls/projections.raw" bs=$bytes seek=5 conv=notrunc status=none
+	balls=$(cbct upload "$work/balls" | head -1)
+	calibrated
+	expect_json '.used == 23 and (.views[5].used | not)'
+	expect_json 'any(.warnings[]; .code == "calibration_views" and (.detail | test("^1 of 24 views are not used, .* off where the arm moves as evenly as elsewhere, and by the jump where it jumps: ")))'
+	scan "{\"kind\": \"calibration\", \"id\": \"$calibration\"}"
+	expect_status 201
+	expect_json '[.warnings[] | select(.code == "calibration_interpolated").detail] == ["1 of the 24 calibrated views were not used: their places are between their neighbours'"'"', off by the jump where the panel jumped"]'
+	scan "{\"kind\": \"calibration\", \"id\": \"$calibration\", \"first_angle_deg\": 3, \"angle_step_deg\": 10}" 36
+	expect_status 201
+	expect_json 'any(.warnings[]; .code == "calibration_interpolated" and (.detail | test("^24 views were calibrated, .* by angle; 1 of the 24 calibrated views were not used")))'
+	stop_daemon
+}
+
 run_tests
