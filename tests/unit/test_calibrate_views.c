@@ -411,6 +411,17 @@ START_TEST(sources_about_no_axis_have_that_of_the_drawing)
 }
 END_TEST
 
+/* Two circles as they are drawn, and as they stand: leaning by `tilt`, radians, and moved. */
+static void draw_and_move(struct balls *ret_drawing, struct balls *ret_balls, double tilt, const double shift[3])
+{
+	struct error err;
+
+	ck_assert(balls_circles(ret_drawing, &circles, &err) == 0);
+	ck_assert(balls_circles(ret_balls, &circles, &err) == 0);
+	for (int b = 0; b < ret_balls->count; b++)
+		tilt_and_shift(&ret_balls->ball[b], tilt, shift);
+}
+
 /* A phantom that stands beside the axis and leans: its neighbours turn about the arm's axis, not about the drawing's.
  */
 START_TEST(a_phantom_may_stand_beside_the_axis_and_lean)
@@ -421,10 +432,7 @@ START_TEST(a_phantom_may_stand_beside_the_axis_and_lean)
 	struct calibration calibration;
 	struct error err = {0};
 
-	ck_assert(balls_circles(&drawing, &circles, &err) == 0);
-	ck_assert(balls_circles(&balls, &circles, &err) == 0);
-	for (int b = 0; b < balls.count; b++)
-		tilt_and_shift(&balls.ball[b], .12, shift);
+	draw_and_move(&drawing, &balls, .12, shift);
 	scene.target = (struct target){.balls = &balls, .ball = .4, .photons = 20000};
 	ck_assert_msg(arm_calibrate(&scene.arm, arm_image, &scene, &drawing, false, &calibration, &err) == 0, "%s",
 		      err.text);
@@ -482,10 +490,7 @@ START_TEST(a_phantom_beside_the_axis_of_a_short_arc_has_its_scale)
 	struct calibration calibration;
 	struct error err = {0};
 
-	ck_assert(balls_circles(&drawing, &circles, &err) == 0);
-	ck_assert(balls_circles(&balls, &circles, &err) == 0);
-	for (int b = 0; b < balls.count; b++)
-		tilt_and_shift(&balls.ball[b], 0, shift);
+	draw_and_move(&drawing, &balls, 0, shift);
 	scene.arm.count = 16;
 	scene.arm.first = -75 * M_PI / 180;
 	scene.arm.step = 10 * M_PI / 180;
