@@ -550,11 +550,125 @@ static void plate_scene(struct scene *ret_scene)
 static void (*const scenes[])(struct scene *) = {small_scene, cut_off_scene, plate_scene};
 enum { SCENES = sizeof(scenes) / sizeof(scenes[0]) };
 
+/* Conjugate gradients of a scene's projections as they are, iteration by iteration. */
+struct descent {
+	struct device *device;
+	struct problem problem;
+	struct stack *projections, *residual, *projected, *weights; /* the test's own, the weights 1/mm */
+	int views[64];
+};
+
+static void descent_open(struct descent *ret, const struct scene *scene, const struct recipe *recipe)
+{
+	const struct backend *backend = &backend_cpu;
+	const struct geometry *geometry = &scene->geometry;
+	struct plan_options options = {
+	    .geometry = geometry, .grid = &recipe->grid, .linearise = {.sample = SAMPLE_FLOAT32}, .matched = true};
+	struct problem *problem = &ret->problem;
+	struct stack **const stacks[] = {&ret->projections,   &ret->residual,      &ret->projected,    &ret->weights,
+					 &problem->stacks[0], &problem->stacks[1], &problem->stacks[2]};
+	struct volume **const volumes[] = {&problem->volume, &problem->before, &problem->volumes[0]};
+
+	ck_assert_int_le(geometry->count, (int)(sizeof(ret->views) / sizeof(ret->views[0])));
+	for (int i = 0; i < geometry->count; i++)
+		ret->views[i] = i;
+	ok(backend->open(0, &(struct device_options){.threads = 2}, &ret->device, &err));
+	ok(backend->plan_new(ret->device, &options, &problem->plan, &err));
+	for (size_t i = 0; i < sizeof(stacks) / sizeof(stacks[0]); i++)
+		ok(backend->stack_new(ret->device, geometry->columns, geometry->rows, geometry->count, stacks[i],
+				      &err));
+	for (size_t i = 0; i < sizeof(volumes) / sizeof(volumes[0]); i++)
+		ok(backend->volume_new(ret->device, &recipe->grid, volumes[i], &err));
+	ok(backend->stack_upload(ret->projections, 0, geometry->count, scene->projections, &err));
+	problem->backend = backend;
+	problem->device = ret->device;
+	problem->geometry = geometry;
+	problem->grid = &recipe->grid;
+	problem->projections = ret->projections;
+	problem->views = ret->views;
+	problem->nonnegative = recipe->iterate.nonnegative;
+	ok(backend->stack_fill(ret->weights, geometry->count, 1, &err));
+	ok(problem_divide_by_lengths(problem, ret->projected, ret->weights, &err));
+}
+
+/* ||b - A x||_W of the iterate, projected anew. */
+static double descent_norm(struct descent *descent)
+{
+	const struct problem *problem = &descent->problem;
+	const struct backend *backend = problem->backend;
+	const int views = problem->geometry->count;
+	double norm2;
+
+	ok(problem_project(problem, problem->volume, descent->projected, &err));
+	ok(backend->stack_axpby(1, descent->projections, NULL, views, 0, descent->residual, &err));
+	ok(backend->stack_axpby(-1, descent->projected, NULL, views, 1, descent->residual, &err));
+	ok(backend->stack_dot(problem->plan, descent->weights, descent->residual, descent->residual, views, &norm2,
+			      &err));
+	return sqrt(norm2);
+}
+
+static void descent_close(struct descent *descent)
+{
+	const struct problem *problem = &descent->problem;
+	struct stack *const stacks[] = {descent->projections, descent->residual,  descent->projected, descent->weights,
+					problem->stacks[0],   problem->stacks[1], problem->stacks[2]};
+	struct volume *const volumes[] = {problem->volume, problem->before, problem->volumes[0]};
+
+	for (size_t i = 0; i < sizeof(stacks) / sizeof(stacks[0]); i++)
+		backend_cpu.stack_free(stacks[i]);
+	for (size_t i = 0; i < sizeof(volumes) / sizeof(volumes[0]); i++)
+		backend_cpu.volume_free(volumes[i]);
+	backend_cpu.plan_free(problem->plan);
+	backend_cpu.close(descent->device);
+}
+
 /*
- * Of exact integrals, for each scene from zero and from the FDK volume, with x >= 0 and without: the residual falls at
- * each iteration, and ends below that of as many iterations of SIRT. No voxel is below 0 where none may be.
+ * The same scenes and starts as below: ||b - A x||_W, which these iterations minimise (core/recon/cgls.c), falls at
+ * each of them. The residual of the history has no weights, and nothing makes that fall at each: where the rays'
+ * lengths in the grid differ much, as of a ball that the detector cuts off, it has risen by .03 % while this norm fell
+ * by .6 %.
  */
-START_TEST(the_residual_of_conjugate_gradients_falls)
+START_TEST(conjugate_gradients_descend_in_the_norm_that_they_minimise)
+{
+	struct recipe recipe = small_recipe(&algorithm_cgls), fdk = recipe_on(&recipe.grid);
+	struct descent descent = {0};
+	struct outcome start = {0};
+	struct scene scene;
+	double before = INFINITY;
+	void *state;
+
+	recipe.iterate.nonnegative = _i / 2 % 2;
+	scenes[_i / 4](&scene);
+	descent_open(&descent, &scene, &recipe);
+	ok(backend_cpu.volume_fill(descent.problem.volume, 0, &err));
+	if (_i % 2) {
+		fdk.fdk.on = true;
+		run(&scene, &fdk, &start);
+		ok(backend_cpu.volume_upload(descent.problem.volume, start.last, &err));
+	}
+	ok(algorithm_cgls.open(&descent.problem, &state, &err));
+	for (int i = 0; i < 25; i++) {
+		struct iteration_sums sums;
+		double norm;
+
+		ok(algorithm_cgls.iterate(&descent.problem, state, i == 0, &sums, &err));
+		norm = descent_norm(&descent);
+		ck_assert_msg(norm < before, "iteration %d: %.9g, before %.9g", i + 1, norm, before);
+		before = norm;
+	}
+	algorithm_cgls.close(&descent.problem, state);
+	descent_close(&descent);
+	outcome_clear(&start);
+	scene_clear(&scene);
+}
+END_TEST
+
+/*
+ * Of exact integrals, for each scene from zero and from the FDK volume, with x >= 0 and without: the residual of
+ * the history ends below that of the first iteration and that of as many iterations of SIRT. No voxel is below 0 where
+ * none may be.
+ */
+START_TEST(conjugate_gradients_explain_more_than_sirt)
 {
 	const int last = 24;
 	struct recipe recipe = small_recipe(&algorithm_cgls);
@@ -567,9 +681,7 @@ START_TEST(the_residual_of_conjugate_gradients_falls)
 	scenes[_i / 4](&scene);
 	run(&scene, &recipe, &cgls);
 	ck_assert_int_eq(cgls.row_count, last + 1);
-	for (int i = 1; i < cgls.row_count; i++)
-		ck_assert_msg(cgls.rows[i].residual < cgls.rows[i - 1].residual, "iteration %d: %g, before %g", i + 1,
-			      cgls.rows[i].residual, cgls.rows[i - 1].residual);
+	ck_assert_double_lt(cgls.rows[last].residual, cgls.rows[0].residual);
 	ck_assert(!recipe.iterate.nonnegative || cgls.kept[0].norms.minimum >= 0);
 	recipe_set_algorithm(&recipe, &algorithm_sart);
 	recipe.sart.subsets = 1;
@@ -758,8 +870,11 @@ Suite *algorithm_suite(void)
 	tcase_add_loop_test(rows, a_run_whose_pixels_are_averaged_goes_on_with_the_same_bits, 0, 3);
 	tcase_add_loop_test(rows, every_algorithm_can_be_cancelled_and_stops_by_its_rules, 0, ALGORITHM_COUNT);
 	/* Each scene once, each of the four recipes once; the others are long. */
-	for (int i = 0; i < 4 * SCENES; i++)
-		tcase_add_loop_test(i % 5 == 0 ? cgls : longer, the_residual_of_conjugate_gradients_falls, i, i + 1);
+	for (int i = 0; i < 4 * SCENES; i++) {
+		tcase_add_loop_test(i % 5 == 0 ? cgls : longer,
+				    conjugate_gradients_descend_in_the_norm_that_they_minimise, i, i + 1);
+		tcase_add_loop_test(i % 5 == 0 ? cgls : longer, conjugate_gradients_explain_more_than_sirt, i, i + 1);
+	}
 	tcase_add_test(cgls, conjugate_gradients_by_default_are_no_worse_than_fdk);
 	tcase_add_test(cgls, blank_views_are_left_out_of_conjugate_gradients);
 	suite_add_tcase(suite, algebra);
