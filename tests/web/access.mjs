@@ -146,17 +146,32 @@ test('a device that is set aside is told, and an administrator clears it', async
 
 test('a session that ends asks again', async () => {
 	const page = await open(browser, '/')
+	/* What is asked for in the first session is refused when that has ended, and the answer is late: in the second one. */
+	const signal = () => { let give; const promise = new Promise(resolve => { give = resolve }); return { promise, give } }
+	const ended = signal(), refused = signal(), again = signal()
+	await page.route('**/v1/devices', async route => {
+		await ended.promise
+		const response = await route.fetch()
+		refused.give(response.status())
+		await again.promise
+		await route.fulfill({ response })
+	}, { times: 1 })
 	await signIn(page, VIEW)
 	await page.waitForSelector(`.jobs a[href="#/jobs/${finished}"]`)
 	const [cookie] = await page.context().cookies()
 	await fetch(`${origin}/v1/session`, { method: 'DELETE', headers: { Cookie: `${cookie.name}=${cookie.value}` } })
-	/* The page may hear of it by itself, and have asked before the job is clicked: then that is done once the list is back. */
-	const click = page.click(`.jobs a[href="#/jobs/${finished}"]`)
-	click.catch(() => {}) /* is waited for below */
+	ended.give()
+	expect(await refused.promise === 401, 'no devices without a session')
+	/* The page may hear of it by itself, and ask before the job is gone to: that is shown once somebody is known. */
+	await page.evaluate(job => { location.hash = `#/jobs/${job}` }, finished)
 	await page.waitForSelector('.signin')
 	await signIn(page, VIEW)
-	await click
 	await page.waitForSelector('.head .badge.succeeded')
+	const answered = page.waitForResponse(response => response.url().endsWith('/v1/devices') && response.status() === 401)
+	again.give()
+	await answered
+	await page.evaluate(() => new Promise(resolve => setTimeout(resolve, 100)))
+	expect(await page.locator('.head .badge.succeeded').count() === 1 && await page.locator('.signin').count() === 0, 'still the job')
 	await page.context().close()
 })
 

@@ -21,14 +21,18 @@ async function problemOf(response) {
 	return new Problem(response.status, document)
 }
 
+/* How often somebody signed in. A refusal of what was asked before that says nothing of who is here now. */
+let session = 0
+
 async function ask(method, path, { body, headers, signal } = {}) {
+	const asked = session
 	const response = await fetch(path, {
 		method,
 		headers: { Accept: 'application/json', ...(body ? { 'Content-Type': 'application/json' } : {}), ...headers },
 		body: body ? JSON.stringify(body) : undefined,
 		signal,
 	})
-	if (response.status === 401)
+	if (response.status === 401 && asked === session)
 		dispatchEvent(new Event('signed-out'))
 	if (!response.ok)
 		throw await problemOf(response)
@@ -38,6 +42,12 @@ async function ask(method, path, { body, headers, signal } = {}) {
 export async function request(method, path, options) {
 	const response = await ask(method, path, options)
 	return response.status === 204 ? null : response.json()
+}
+
+/* From now on the token's bearer is who asks. */
+export async function newSession(token) {
+	await request('POST', '/v1/session', { headers: { Authorization: `Bearer ${token}` } })
+	session++
 }
 
 /* The same with the tag that a change of what is there must name. */

@@ -5,7 +5,7 @@
  * from who may only view. The daemon refuses it in any case.
  */
 import { h, replace } from './dom.js'
-import { request } from './api.js'
+import { request, newSession } from './api.js'
 import { t } from './lang.js'
 
 /* Resolves with who it is; null: somebody has to sign in. What else goes wrong is thrown. */
@@ -29,7 +29,7 @@ function tokenForm(done) {
 		submit.disabled = true
 		trouble.hidden = true
 		try {
-			await request('POST', '/v1/session', { headers: { Authorization: `Bearer ${input.value.trim()}` } })
+			await newSession(input.value.trim())
 			done()
 		} catch (error) {
 			trouble.textContent = error.status === 401 ? t('No valid token.') : error.message
