@@ -347,6 +347,8 @@ static int next_of_line(const struct look *look, const struct grid *grid, size_t
 static void look_along(const struct look *look, const struct grid *grid, const struct shadow *shadow, int y, int z)
 {
 	const int columns = shadow->columns, rows = shadow->rows;
+	/* From the middle of the outermost row outwards FDK has ever less of a view, unless there is no other row. */
+	const double beyond = rows > 1 ? 0 : 0.5;
 	const size_t line = grid_voxel(grid, 0, y, z);
 
 	if (look->seen == NULL && misses_rows(shadow, grid, y, z))
@@ -359,7 +361,7 @@ static void look_along(const struct look *look, const struct grid *grid, const s
 		if (look->seen != NULL && look->empty[at] && !look->seen[at])
 			continue; /* the view can say no more of it */
 		view_project(shadow->matrix, place.at, &column, &row);
-		if (look->seen != NULL && (row < -0.5 || row > rows - 0.5))
+		if (look->seen != NULL && (row < -beyond || row > rows - 1 + beyond))
 			look->seen[at] = false;
 		if (!(column >= 1 && row >= 1 && column <= columns - 2 && row <= rows - 2))
 			continue;

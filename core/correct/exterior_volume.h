@@ -67,7 +67,9 @@ struct exterior_volume {
 	struct plan *plan;
 	struct volume *volume;
 	float *voxels; /* the same on the host, owned */
-	bool *seen; /* [voxels], owned: on the rows of all views and, where rows are truncated, in the field of view */
+	/* [voxels], owned: between the middles of the outermost rows of all views (one row: on it) and, where rows are
+	 * truncated, in the field of view */
+	bool *seen;
 	size_t truncated[2]; /* as of backend.filter_extended */
 	bool goes_on;        /* something is left outside of the recipe's grid */
 };

@@ -773,6 +773,45 @@ START_TEST(the_rim_of_the_field_of_view_is_as_true_as_that_of_fdk)
 END_TEST
 
 /*
+ * Six rows, all of which the grid holds: a body that is longer than they are and wider than the detector is as right in
+ * the end slices as in the middle, where they were 90 HU too low.
+ */
+START_TEST(the_end_slices_of_few_rows_are_true_in_a_body_wider_than_the_detector)
+{
+	static const double radius = 0.6 * 64.5; /* mm, of the field of view */
+	struct ellipsoid body = {SHAPE_CYLINDER, {90, 75, 500}, {0, 0, 0}, 0, MU_WATER};
+	const struct phantom phantom = {1, &body};
+	const struct orbit_spec spec = {96, 6, 60, {620, 1100, {2.4, 2.4}, {0, 0}, {0, 0}}, 0, 6};
+	const struct grid grid = grid_of(96, 96, 4, 1.35, 1.35, 1.35);
+	struct recipe recipe = sart_on(&grid);
+	struct outcome outcome = {0};
+	struct scene scene;
+	size_t at = 0;
+
+	recipe.iterate.iterations = 3;
+	scene_orbit(&scene, &spec);
+	scene_add(&scene, &phantom);
+	run(&scene, &recipe, &outcome);
+	for (int z = 0; z < grid.size[2]; z++) {
+		double sum = 0;
+		int count = 0;
+
+		for (int y = 0; y < grid.size[1]; y++)
+			for (int x = 0; x < grid.size[0]; x++, at++)
+				if (hypot(grid.origin[0] + x * grid.spacing[0], grid.origin[1] + y * grid.spacing[1]) <
+				    radius) {
+					sum += 1000 * ((double)outcome.last[at] / MU_WATER - 1);
+					count++;
+				}
+		ck_assert_msg(fabs(sum / count) < 10, "slice %d of %d: %.1f HU", z, grid.size[2], sum / count);
+	}
+	ck_assert_ptr_nonnull(strstr(outcome.warnings, "outside_grid: "));
+	outcome_clear(&outcome);
+	scene_clear(&scene);
+}
+END_TEST
+
+/*
  * From zero, on a grid that goes on beyond the field of view, a part of a body that goes on there, too, is put there:
  * 100 to 300 HU. It is told then, and not where the grid ends with the field, the run begins with FDK, or the body ends
  * in the field.
@@ -1176,6 +1215,7 @@ Suite *exterior_suite(void)
 	suite_add_tcase(suite, tests);
 	tcase_add_loop_test(truncated, iterations_of_a_body_wider_than_the_detector_are_as_true_as_fdk, 0, COUNT(wide));
 	tcase_add_loop_test(truncated, the_rim_of_the_field_of_view_is_as_true_as_that_of_fdk, 0, 2);
+	tcase_add_test(truncated, the_end_slices_of_few_rows_are_true_in_a_body_wider_than_the_detector);
 	tcase_add_loop_test(truncated, a_body_that_is_spread_beyond_the_field_of_view_is_told, 0, 6);
 	tcase_add_loop_test(truncated, what_lies_outside_is_sought_about_an_axis_beside_the_origin, 0, 2);
 	suite_add_tcase(suite, truncated);
