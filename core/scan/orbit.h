@@ -54,8 +54,8 @@ struct orbit {
 	 * mm, in the world: about it, along the frame's z, are angles and FDK's weights, the field of view, what is
 	 * sought outside of a grid, and the grids below. It is the origin; but where the sources' circle has its middle
 	 * beside that and has surely the wider field of view there (a real arm's is some mm beside it), or a displaced
-	 * detector sees hardly any of both sides of the origin, that middle; and where the rows do not reach the
-	 * origin's height, their middle's.
+	 * detector sees hardly any of both sides of the origin, that middle; and its height is the mean of those
+	 * of the middle row on the axis, unless fewer views see that or there is one row alone.
 	 */
 	double centre[3];
 	double field_of_view; /* mm, diameter of the cylinder that all views see, or one half when displaced */

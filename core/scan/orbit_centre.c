@@ -95,20 +95,20 @@ double orbit_middle_row(const struct orbit *orbit, const struct geometry *geomet
 	return sum / geometry->count;
 }
 
-/* True if most views have the centre above or below their rows. */
-static bool is_off_rows(const struct orbit *orbit, const struct geometry *geometry)
+/* Counts the views that have the centre on their rows. */
+static int views_of_centre(const struct orbit *orbit, const struct geometry *geometry)
 {
 	static const double centre[3] = {0};
-	int off = 0;
+	int count = 0;
 
 	for (int k = 0; k < geometry->count; k++) {
 		const struct view view = orbit_view(orbit, &geometry->views[k]);
 		double matrix[12], column, row;
 
 		view_matrix(&view, matrix);
-		off += view_project(matrix, centre, &column, &row) > 0 && !(row > -1 && row < geometry->rows);
+		count += view_project(matrix, centre, &column, &row) > 0 && row > -1 && row < geometry->rows;
 	}
-	return off > geometry->count / 2;
+	return count;
 }
 
 static void move_centre(struct orbit *orbit, const double by[3])
@@ -120,7 +120,7 @@ static void move_centre(struct orbit *orbit, const double by[3])
 
 bool orbit_find_centre(struct orbit *orbit, const struct geometry *geometry)
 {
-	const double wider = 1.05, enough = 0.5;
+	const double wider = 1.05, enough = 0.5, rounding = 1e-6; /* of a row */
 	struct orbit moved = *orbit;
 	double by[3] = {0}, height;
 	bool beside;
@@ -133,7 +133,11 @@ bool orbit_find_centre(struct orbit *orbit, const struct geometry *geometry)
 	if (beside)
 		*orbit = moved;
 	height = orbit_middle_row(orbit, geometry);
-	if (geometry->rows > 1 && is_off_rows(orbit, geometry) && isfinite(height))
-		move_centre(orbit, (const double[]){0, 0, height});
+	moved = *orbit;
+	if (geometry->rows > 1 && fabs(height) > rounding * orbit->pixel_at_isocentre[1])
+		move_centre(&moved, (const double[]){0, 0, height});
+	/* Of views that wander, the mean may be where none looks. */
+	if (views_of_centre(&moved, geometry) >= views_of_centre(orbit, geometry))
+		*orbit = moved;
 	return beside;
 }

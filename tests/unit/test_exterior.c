@@ -899,6 +899,47 @@ START_TEST(what_lies_outside_is_sought_about_an_axis_beside_the_origin)
 }
 END_TEST
 
+/*
+ * The world's origin is a name: a trunk that goes on, moved as a whole with the arm and the grid, by less than the rows
+ * reach along z, has the same image. Where what lies outside was sought about the origin's height, voxels were 242 HU
+ * apart.
+ */
+START_TEST(a_scan_moved_along_z_has_the_same_image)
+{
+	static const double by = 47; /* mm; the rows reach 84 */
+	const struct orbit_spec spec = {COLUMNS, ROWS, 36, {620, 1100, {PIXEL, PIXEL}, {0, 0}, {0, 0}}, 13, 10};
+	struct ellipsoid parts[sizeof(trunk_parts) / sizeof(*trunk_parts)];
+	const struct phantom phantom = {trunk.count, parts};
+	struct grid grid = grid_between(75, 75, 5);
+	struct outcome outcomes[2] = {0};
+	double worst = 0;
+
+	memcpy(parts, trunk_parts, sizeof(parts));
+	for (int i = 0; i < 2; i++) {
+		struct recipe recipe = sart_on(&grid);
+		struct scene scene;
+
+		recipe.iterate.iterations = 2;
+		scene_orbit(&scene, &spec);
+		for (int k = 0; k < spec.views && i == 1; k++) {
+			scene.geometry.views[k].source[2] += by;
+			scene.geometry.views[k].pixel0[2] += by;
+		}
+		for (int k = 0; k < phantom.count && i == 1; k++)
+			parts[k].centre[2] += by;
+		recipe.grid.origin[2] += i * by;
+		scene_add(&scene, &phantom);
+		run(&scene, &recipe, &outcomes[i]);
+		scene_clear(&scene);
+	}
+	for (size_t v = 0; v < grid_voxels(&grid); v++)
+		worst = fmax(worst, 1000 * fabs((double)outcomes[1].last[v] - (double)outcomes[0].last[v]) / MU_WATER);
+	ck_assert_msg(worst < 1, "%g HU apart", worst);
+	for (int i = 0; i < 2; i++)
+		outcome_clear(&outcomes[i]);
+}
+END_TEST
+
 /* Any number of threads, a run that has yielded, and just the memory that the job says: the same bits. */
 START_TEST(the_same_bits_with_other_threads_after_a_yield_and_in_just_the_memory_that_was_said)
 {
@@ -1218,6 +1259,7 @@ Suite *exterior_suite(void)
 	tcase_add_test(truncated, the_end_slices_of_few_rows_are_true_in_a_body_wider_than_the_detector);
 	tcase_add_loop_test(truncated, a_body_that_is_spread_beyond_the_field_of_view_is_told, 0, 6);
 	tcase_add_loop_test(truncated, what_lies_outside_is_sought_about_an_axis_beside_the_origin, 0, 2);
+	tcase_add_test(truncated, a_scan_moved_along_z_has_the_same_image);
 	suite_add_tcase(suite, truncated);
 	tcase_add_loop_test(last, the_end_slices_are_no_worse_than_those_of_fdk_where_a_body_ends, 0, COUNT(ended));
 	tcase_add_loop_test(last, the_last_slices_of_a_skull_have_the_mean_that_the_iterate_has, 0, COUNT(skulls));
