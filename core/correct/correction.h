@@ -50,10 +50,10 @@ struct correction_job {
 	const struct input *input;   /* what was seen of the samples so far (core/correct/input.h) */
 	const int *iteration;        /* iterations that are done */
 	/*
-	 * Called before the start of the iterations is changed, where the object is wider than the detector and they
-	 * begin with FDK.
+	 * Where the object is wider than the detector and the iterations begin, called for all slices before the start
+	 * is changed, and once more for those that not all views see when it has been.
 	 */
-	int (*wide)(void *context, struct error *err);
+	int (*wide)(void *context, int first, int count, struct error *err);
 	void *wide_context;
 	bool averages;                     /* recipe_averages: iterations get means over pixels (averaging.h) */
 	bool subsets;                      /* iterations are SART's */

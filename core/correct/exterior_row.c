@@ -179,6 +179,17 @@ static int make(const struct correction_job *job, struct exterior_volume_options
 	return code == 0 && !shows_nothing(ret_seen) ? exterior_volume_make(exterior, options, err) : code;
 }
 
+/* Slices with places that not all views see have begun with the model of the exterior there, and not with FDK alone. */
+static int renew_unseen(const struct correction_job *job, struct error *err)
+{
+	const struct grid *grid = &job->recipe->grid;
+	int unseen[2], code = orbit_unseen_slices(job->orbit, job->geometry, grid, unseen, err);
+
+	if (code == 0)
+		code = job->wide(job->wide_context, 0, unseen[0], err);
+	return code == 0 ? job->wide(job->wide_context, grid->size[2] - unseen[1], unseen[1], err) : code;
+}
+
 /*
  * The exterior is found from the projections alone, so that a run that goes on from an iterate gives the same bits.
  * `work` holds the iterate before the iteration, which the first iteration writes anyway.
@@ -210,9 +221,11 @@ static int apply(const struct correction_job *job, void *state, enum correction_
 		return code;
 	}
 	if (options.truncated && *job->iteration == 0)
-		code = job->wide(job->wide_context, err);
+		code = job->wide(job->wide_context, 0, options.grid->size[2], err);
 	if (code == 0)
 		code = subtract(job, &options, &seen, exterior, &rows, &taken, err);
+	if (code == 0 && options.truncated && *job->iteration == 0)
+		code = renew_unseen(job, err);
 	if (code == 0 && !fdk && sound && job->recipe->fdk.extend &&
 	    truncated_warn(job, exterior->truncated, job->geometry->columns))
 		warn_of_zero(job);

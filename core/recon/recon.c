@@ -90,11 +90,11 @@ static int open_plan(struct recon *recon, struct error *err)
 }
 
 /* The rim is that of the volume that the iterations begin with. */
-static int begin_rim(void *context, struct error *err)
+static int begin_rim(void *context, int first, int count, struct error *err)
 {
 	struct recon *recon = context;
 
-	return recon->rim != NULL ? rim_begin(recon->rim, recon->backend, recon->volume, err) : 0;
+	return recon->rim != NULL ? rim_begin(recon->rim, recon->backend, recon->volume, first, count, err) : 0;
 }
 
 static int open_corrections(struct recon *recon, struct error *err)

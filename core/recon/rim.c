@@ -130,12 +130,15 @@ static float *new_slice(const struct rim *rim, struct error *err)
 	return slice;
 }
 
-int rim_begin(struct rim *rim, const struct backend *backend, struct volume *volume, struct error *err)
+int rim_begin(struct rim *rim, const struct backend *backend, struct volume *volume, int first, int count,
+	      struct error *err)
 {
 	float *slice = new_slice(rim, err);
-	int code = slice != NULL ? make_room(rim, err) : ERR_NO_MEMORY;
+	int code = slice != NULL ? 0 : ERR_NO_MEMORY;
 
-	for (int z = 0; z < rim->grid.size[2] && code == 0; z++) {
+	if (code == 0 && rim->begun == NULL)
+		code = make_room(rim, err);
+	for (int z = first; z < first + count && code == 0; z++) {
 		float *begun = rim->begun + (size_t)z * rim->count;
 
 		code = backend->volume_download(volume, z, 1, slice, err);

@@ -9,7 +9,9 @@
  * What the projections hold of such a body beyond the field of view is known up to some smooth part
  * (core/correct/exterior.h). Where a surface of the body lies near the rim, what is left of it is not smooth, and
  * iterations put it into the outermost voxels, more with each: 30 to 100 HU more than FDK has there, and nothing
- * within. So a volume that is kept goes over to the volume that the iterations began with, B, FDK's after TV:
+ * within. So a volume that is kept goes over to the volume that the iterations began with, B, FDK's after TV. In
+ * slices with places that not all views see that is too low, by some hundreds of HU, but for the model of the exterior
+ * that the iterations begin with there (exterior_start): B has it, too.
  *
  *   V' = V + w (B - V),  w = (r / R - 0.78) / 0.08, held to 0 .. 1
  *
@@ -29,8 +31,9 @@ int rim_new(const struct grid *grid, const struct orbit *orbit, bool nonnegative
 	    struct error *err);
 void rim_free(struct rim *rim); /* NULL is fine */
 
-/* Takes B from the volume. */
-int rim_begin(struct rim *rim, const struct backend *backend, struct volume *volume, struct error *err);
+/* Takes B of these slices from the volume; all of them at first. */
+int rim_begin(struct rim *rim, const struct backend *backend, struct volume *volume, int first, int count,
+	      struct error *err);
 /* B as bytes [rim_state_bytes], for a run that goes on; 0 of them for NULL, and before there is B. */
 size_t rim_state_bytes(const struct rim *rim);
 const float *rim_state(const struct rim *rim);
