@@ -276,7 +276,9 @@ static int on_volume(void *context, const struct kept_volume *volume, const stru
 				  .norms = volume->norms,
 				  .estimate_mm = volume->estimate_mm,
 				  .support = volume->support,
-				  .bytes = saved->bytes};
+				  .bytes = saved->bytes,
+				  .written_s = (size_t)saved->written.tv_sec,
+				  .written_ns = (size_t)saved->written.tv_nsec};
 
 	snprintf(message.name, sizeof(message.name), "%s", volume->name);
 	snprintf(message.volume_stage, sizeof(message.volume_stage), "%s", volume->stage);

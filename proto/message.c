@@ -112,6 +112,8 @@ static const struct field volume_fields[] = {FIELD("job", FIELD_STRING, job),
 					     FIELD("held_out", FIELD_INT, support.held_out),
 					     FIELD("held_residual", FIELD_NUMBER, support.held_residual),
 					     FIELD("used_residual", FIELD_NUMBER, support.used_residual),
+					     FIELD("written_s", FIELD_SIZE, written_s),
+					     FIELD("written_ns", FIELD_SIZE, written_ns),
 					     {0}};
 static const struct field settled_fields[] = {FIELD("job", FIELD_STRING, job), FIELD("name", FIELD_STRING, name), {0}};
 static const struct field checkpoint_fields[] = {

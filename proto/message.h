@@ -43,8 +43,8 @@ enum message_kind {
 	MESSAGE_RECONSTRUCTED,
 	MESSAGE_PROGRESS,   /* job, stage, iteration, fraction */
 	MESSAGE_ROW,        /* job, row */
-	MESSAGE_VOLUME,     /* job, name, stage, iteration, bytes, norms, estimate_mm, support: the file is there,
-			       whole, for everybody */
+	MESSAGE_VOLUME,     /* job, name, stage, iteration, bytes, norms, estimate_mm, support, written: the file is
+			       there, whole, for everybody */
 	MESSAGE_SETTLED,    /* job, name: that file is on the disk; before the job ends, but for what failed */
 	MESSAGE_CHECKPOINT, /* job, iteration: a checkpoint of it is on the disk */
 	MESSAGE_NOISE,      /* job, noise_hu, alpha: what TV goes by, see recon_hooks.denoising */
@@ -88,6 +88,7 @@ struct message {
 	double estimate_mm;
 	struct volume_support support;
 	size_t bytes;
+	size_t written_s, written_ns;  /* the time of change of a volume's file (saver_written) */
 	char code_name[64], text[512]; /* WARNING: code and detail; ENDED: text */
 	int code, card;
 };

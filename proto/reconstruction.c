@@ -333,7 +333,7 @@ static int write_voxels(struct run *run, struct recon *recon, struct error *err)
 
 /* Header and voxels under the volume's own name. */
 static int write_volume(struct run *run, struct recon *recon, const struct kept_volume *kept,
-			const struct saved_volume *saved, struct error *err)
+			struct saved_volume *saved, struct error *err)
 {
 	uint8_t header[FORMAT_HEADER_MAX];
 	size_t length;
@@ -353,6 +353,7 @@ static int write_volume(struct run *run, struct recon *recon, const struct kept_
 		code = write_voxels(run, recon, err);
 	if (code != 0)
 		return code;
+	saved->written = saver_written(run->saver);
 	run->saved = *saved;
 	run->saved_iteration = kept->iteration;
 	snprintf(run->saved_name, sizeof(run->saved_name), "%s", kept->name);
@@ -361,8 +362,8 @@ static int write_volume(struct run *run, struct recon *recon, const struct kept_
 }
 
 /* As another name of the volume that was written last, where it is the same and the file system can do that. */
-static int link_volume(struct run *run, const struct kept_volume *kept, const struct saved_volume *saved,
-		       bool *ret_linked, struct error *err)
+static int link_volume(struct run *run, const struct kept_volume *kept, struct saved_volume *saved, bool *ret_linked,
+		       struct error *err)
 {
 	bool same = run->saved.bytes > 0 && run->saved_iteration == kept->iteration &&
 		    strcmp(run->saved_stage, kept->stage) == 0;
@@ -372,6 +373,7 @@ static int link_volume(struct run *run, const struct kept_volume *kept, const st
 	if (code == 0 && same)
 		code = durable_link(run->saved.path, saved->path, ret_linked, err);
 	if (code == 0 && *ret_linked) {
+		saved->written = run->saved.written;
 		run->link = *saved;
 		snprintf(run->link_name, sizeof(run->link_name), "%s", kept->name);
 	}

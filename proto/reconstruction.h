@@ -3,6 +3,7 @@
 
 #include <stdbool.h>
 #include <stddef.h>
+#include <time.h>
 
 #include "core/recon/recon.h"
 #include "proto/patient.h"
@@ -11,7 +12,8 @@
 /* The file of one kept volume. */
 struct saved_volume {
 	char path[1024];
-	size_t bytes; /* of voxels, the header not counted */
+	size_t bytes;            /* of voxels, the header not counted */
+	struct timespec written; /* saver_written */
 };
 
 /*

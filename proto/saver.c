@@ -54,6 +54,7 @@ struct saver {
 	/* The caller's own; while a file is under way its thread reads them. */
 	bool busy;
 	double seconds; /* that the last file took */
+	struct timespec written;
 	char path[PATH_MAX];
 	struct mapped file;
 	pthread_t syncer;
@@ -447,13 +448,17 @@ static int write_seal(struct saver *saver, struct error *err)
 int saver_end(struct saver *saver, struct error *err)
 {
 	int code = saver->sealed ? write_seal(saver, err) : 0;
+	struct stat status;
 
+	if (code == 0 && fstat(saver->file.file.file, &status) != 0)
+		code = error_set_errno(err, errno, "%s", saver->path);
 	if (code == 0)
 		code = durable_name(&saver->file.file, err);
 	if (code != 0) {
 		drop_file(saver);
 		return code;
 	}
+	saver->written = status.st_mtim;
 	/* What is dropped from here on goes by that name. */
 	memcpy(saver->file.file.beside, saver->path, sizeof(saver->path));
 	pthread_mutex_lock(&saver->lock);
@@ -461,6 +466,11 @@ int saver_end(struct saver *saver, struct error *err)
 	pthread_cond_broadcast(&saver->changed);
 	pthread_mutex_unlock(&saver->lock);
 	return 0;
+}
+
+struct timespec saver_written(const struct saver *saver)
+{
+	return saver->written;
 }
 
 int saver_finish(struct saver *saver, bool wait, bool *ret_done, struct error *err)

@@ -3,6 +3,7 @@
 
 #include <stdbool.h>
 #include <stddef.h>
+#include <time.h>
 
 #include "core/error.h"
 
@@ -42,6 +43,8 @@ int saver_piece(struct saver *saver, size_t bytes, void **ret_place, struct erro
 void saver_give(struct saver *saver, size_t bytes);
 /* All were given: the file gets its name, or is abandoned. */
 int saver_end(struct saver *saver, struct error *err);
+/* The time of change of the file that was ended last: whoever writes to it later has another. */
+struct timespec saver_written(const struct saver *saver);
 
 /* Whether a file is under way, from saver_begin to a saver_finish that has said how it ended. */
 bool saver_busy(const struct saver *saver);

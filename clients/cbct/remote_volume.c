@@ -203,5 +203,8 @@ int remote_fetch_volume(struct http *http, const char *job, const cJSON *documen
 		return code;
 	}
 	*ret_here = true;
-	return saver_end(saver, err);
+	code = saver_end(saver, err);
+	ret_volume->written_s = (size_t)saver_written(saver).tv_sec;
+	ret_volume->written_ns = (size_t)saver_written(saver).tv_nsec;
+	return code;
 }

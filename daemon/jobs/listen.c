@@ -79,7 +79,8 @@ static int add_volume(struct worker *worker, const struct message *message, stru
 	snprintf(volume.name, sizeof(volume.name), "%s", message->name);
 	snprintf(volume.stage, sizeof(volume.stage), "%s", message->volume_stage);
 	volume.created = clock_realtime();
-	store_volume_trust(jobs_store(job_jobs(worker->job)), message->job, &volume);
+	store_volume_trust(jobs_store(job_jobs(worker->job)), message->job, &volume,
+			   &(struct timespec){(time_t)message->written_s, (long)message->written_ns});
 	return job_add_volume(worker->job, &volume, err);
 }
 

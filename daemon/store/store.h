@@ -554,8 +554,12 @@ int store_volume_verify(struct store *store, const char *job, const struct volum
 /* ERR_DAMAGED, and the words for a volume of this name whose file is not what was written, or is gone. */
 int store_volume_damaged(const char *volume, const char *why, struct error *err);
 int store_volume_gone(const struct volume_record *volume, struct error *err);
-/* A worker has just made the file: what is read of it is still in memory. */
-void store_volume_trust(struct store *store, const char *job, const struct volume_record *volume);
+/*
+ * A worker has just made the file, which had that time of change then: what is read of it is still in memory. A file
+ * that has another one by now is not trusted.
+ */
+void store_volume_trust(struct store *store, const char *job, const struct volume_record *volume,
+			const struct timespec *written);
 /* The jobs that have volumes without a digest. */
 int store_jobs_undigested(struct store *store, void (*visit)(void *context, const char *id), void *context,
 			  struct error *err);

@@ -271,7 +271,8 @@ int store_volume_verify(struct store *store, const char *job, const struct volum
 	return code;
 }
 
-void store_volume_trust(struct store *store, const char *job, const struct volume_record *volume)
+void store_volume_trust(struct store *store, const char *job, const struct volume_record *volume,
+			const struct timespec *written)
 {
 	struct stat status;
 	struct error err;
@@ -279,7 +280,7 @@ void store_volume_trust(struct store *store, const char *job, const struct volum
 
 	if (open_volume(store, job, volume, &file, &err) != 0)
 		return;
-	if (fstat(file, &status) == 0)
+	if (fstat(file, &status) == 0 && same_time(&status.st_mtim, written))
 		note_all(store->verified, &status);
 	close(file);
 }

@@ -545,6 +545,27 @@ test_a_damaged_volume_is_told_once_and_as_long_as_it_is_damaged() {
 	stop_daemon
 }
 
+# The daemon holds what its worker has just made for whole without reading it: but not what has changed since then.
+test_a_volume_that_is_damaged_before_the_daemon_hears_of_it_is_never_sent() {
+	local daemon worker
+	start_daemon
+	post_scan "$scan_dir"
+	post_projections "$scan_dir"
+	daemon=$(cat "$work/daemon.pid")
+	worker=$(worker_of)
+	kill -STOP "$worker"
+	post_job "$large"
+	state_becomes running
+	kill -STOP "$daemon"
+	kill -CONT "$worker"
+	until [ -e "$(made)" ]; do sleep 0.02; done
+	flip "$(made)" $((4096 + 2 * 1048576))
+	kill -CONT "$daemon"
+	wait_job succeeded
+	expect_damaged_volume ""
+	stop_daemon
+}
+
 test_a_damaged_volume_is_told_and_never_sent() {
 	local third=$((4096 + 2 * 1048576))
 	start_daemon
