@@ -623,18 +623,21 @@ test_damaged_checksums_of_a_volume_that_is_whole_do_no_harm() {
 }
 
 test_a_damaged_checkpoint_begins_the_job_again() {
-	local yielded again
+	local yielded again worker
 	start_daemon
+	worker=$(worker_of)
 	post_scan "$scan_dir"
 	post_projections "$scan_dir"
-	post_job "{\"scan\": \"SCAN\", $grid, \"sart\": {\"iterations\": 150, \"subsets\": \"views\"}}"
+	post_job "{\"scan\": \"SCAN\", $grid, \"sart\": {\"iterations\": 300, \"subsets\": \"views\"}}"
 	wait_job succeeded
 	undisturbed
 	for again in flip truncate; do
-		post_job "{\"scan\": \"SCAN\", $grid, \"sart\": {\"iterations\": 150, \"subsets\": \"views\"}}"
+		post_job "{\"scan\": \"SCAN\", $grid, \"sart\": {\"iterations\": 300, \"subsets\": \"views\"}}"
 		yielded=$job
 		until req GET "/v1/jobs/$job" && member '.iteration >= 2' "$body" >/dev/null; do sleep 0.02; done
+		kill -STOP "$worker" # the job is short
 		post_job "{\"scan\": \"SCAN\", $grid, \"sart\": {\"iterations\": 100000, \"subsets\": \"views\"}, \"priority\": \"stat\"}"
+		kill -CONT "$worker"
 		until req GET "/v1/jobs/$job" && member '.iteration >= 1' "$body" >/dev/null; do sleep 0.02; done
 		case $again in
 		flip) flip "$state/jobs/$yielded/checkpoint.f32" 3333 ;;
@@ -644,7 +647,7 @@ test_a_damaged_checkpoint_begins_the_job_again() {
 		expect_json '.state == "cancelled"'
 		job=$yielded
 		wait_job succeeded
-		expect_json '.attempts == 2 and ([.history[].iteration] == [range(1; 151)]) and ([.warnings[] | select(.code == "damaged_checkpoint")] | length == 1)'
+		expect_json '.attempts == 2 and ([.history[].iteration] == [range(1; 301)]) and ([.warnings[] | select(.code == "damaged_checkpoint")] | length == 1)'
 		is_undisturbed
 	done
 	stop_daemon
