@@ -191,7 +191,8 @@ int exterior_look(const struct exterior_volume_options *options, struct exterior
 				       .beside = beside,
 				       .certain = certain,
 				       .first = first - (last >= 0 ? around : 0),
-				       .last = last + (last >= 0 ? around : 0)};
+				       .last = last + (last >= 0 ? around : 0),
+				       .to_ends = first == 0 && last == all - 1};
 	if (code == 0 && found.outside == 0)
 		code = exterior_volume_may_go_on(options, &found.possible, err);
 	if (code == 0)

@@ -39,6 +39,7 @@ struct exterior_rows {
 	size_t truncated, outside;
 	/* Truncated rows, from the first to the last in any view, those around them included; none: first > last. */
 	int first, last; /* exterior_look only */
+	bool to_ends;    /* the outermost rows at both ends are, in some view; exterior_look only */
 	size_t beside;   /* of `outside`, those with rays that miss the grid and are not air; exterior_look only */
 	size_t certain;  /* rows looked at that count something outside, whatever noise may be; exterior_look only */
 	/*

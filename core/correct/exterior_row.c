@@ -113,6 +113,13 @@ static double reach_of(const struct grid *grid, const struct orbit *orbit)
 	return farthest;
 }
 
+static bool ends_with_view(const struct grid *grid, const struct orbit *orbit)
+{
+	const double beyond = 1.04;
+
+	return reach_of(grid, orbit) <= beyond * orbit->field_of_view / 2;
+}
+
 /*
  * Where the object goes on beside the field of view and the grid does, too, iterations from zero spread the object over
  * all of the grid that a ray meets. Those that begin with FDK have it in its place from the first one on
@@ -120,17 +127,16 @@ static double reach_of(const struct grid *grid, const struct orbit *orbit)
  */
 static void warn_of_zero(const struct correction_job *job)
 {
-	const double beyond = 1.04, radius = job->orbit->field_of_view / 2;
-	const double reach = reach_of(&job->recipe->grid, job->orbit);
+	const struct grid *grid = &job->recipe->grid;
 
-	if (reach > beyond * radius)
+	if (!ends_with_view(grid, job->orbit))
 		warning_tell(
 		    job->warnings, "faint_from_zero",
 		    "the object reaches beyond the detector, and the grid (%.4g mm from the axis) beyond the "
 		    "field of view (%.4g mm): iterations from zero put a part of the object there, and HU "
 		    "within are wrong by some tens to hundreds. Begin with the FDK volume (\"fdk\": {}), or end "
 		    "the grid with the field of view",
-		    reach, radius);
+		    reach_of(grid, job->orbit), job->orbit->field_of_view / 2);
 }
 
 /* What the projections show of the exterior: which rows count it, and the model of it that they ask for. */
@@ -148,10 +154,16 @@ static int look(const struct correction_job *job, struct exterior_volume_options
 		seen.truncated = 0;
 		seen.last = -1;
 	}
-	/* An object may end inside of the grid: FDK's blur beyond its faces is none of the object. */
-	options->inside_only = seen.outside == 0 && !seen.possible;
 	/* From zero, iterations take too long to fill what is held beside the field of view where the grid has that. */
-	options->truncated = seen.truncated > 0 && sound && fdk && !options->inside_only;
+	options->truncated = seen.truncated > 0 && sound && fdk;
+	/*
+	 * An object may end inside of the grid: FDK's blur beyond its faces is none of the object. One that truncates
+	 * rows up to both ends goes on beside a grid that ends with the field of view, though no ray that is seen
+	 * leaves that.
+	 */
+	options->inside_only = seen.outside == 0 && !seen.possible &&
+			       !(options->truncated && seen.to_ends && ends_with_view(options->grid, options->orbit));
+	options->truncated = options->truncated && !options->inside_only;
 	if (!options->truncated)
 		seen.last = -1;
 	*ret_seen = seen;

@@ -818,16 +818,25 @@ START_TEST(the_rim_of_slices_that_not_all_views_see_is_true)
 END_TEST
 
 /*
- * Six rows, all of which the grid holds: a body that is longer than they are and wider than the detector is as right in
- * the end slices as in the middle, where they were 90 HU too low.
+ * Six rows, all of which the grid holds, or none of whose rays leaves it by its first or last slice: a body that is
+ * longer than they are and wider than the detector is as right in the end slices as in the middle, where they were 90
+ * and 300 HU too low.
  */
 START_TEST(the_end_slices_of_few_rows_are_true_in_a_body_wider_than_the_detector)
 {
+	static const struct {
+		int columns;
+		double pixel;
+		int across, slices;
+		double voxel;
+	} tries[] = {{96, 2.4, 96, 4, 1.35}, {48, 4.8, 44, 6, 3}};
 	static const double radius = 0.6 * 64.5; /* mm, of the field of view */
 	struct ellipsoid body = {SHAPE_CYLINDER, {90, 75, 500}, {0, 0, 0}, 0, MU_WATER};
 	const struct phantom phantom = {1, &body};
-	const struct orbit_spec spec = {96, 6, 60, {620, 1100, {2.4, 2.4}, {0, 0}, {0, 0}}, 0, 6};
-	const struct grid grid = grid_of(96, 96, 4, 1.35, 1.35, 1.35);
+	const int across = tries[_i].across;
+	const double voxel = tries[_i].voxel, pixel = tries[_i].pixel;
+	const struct orbit_spec spec = {tries[_i].columns, 6, 60, {620, 1100, {pixel, pixel}, {0, 0}, {0, 0}}, 0, 6};
+	const struct grid grid = grid_of(across, across, tries[_i].slices, voxel, voxel, voxel);
 	struct recipe recipe = sart_on(&grid);
 	struct outcome outcome = {0};
 	struct scene scene;
@@ -1301,7 +1310,7 @@ Suite *exterior_suite(void)
 	suite_add_tcase(suite, tests);
 	tcase_add_loop_test(truncated, iterations_of_a_body_wider_than_the_detector_are_as_true_as_fdk, 0, COUNT(wide));
 	tcase_add_loop_test(truncated, the_rim_of_the_field_of_view_is_as_true_as_that_of_fdk, 0, 2);
-	tcase_add_test(truncated, the_end_slices_of_few_rows_are_true_in_a_body_wider_than_the_detector);
+	tcase_add_loop_test(truncated, the_end_slices_of_few_rows_are_true_in_a_body_wider_than_the_detector, 0, 2);
 	tcase_add_test(truncated, the_rim_of_slices_that_not_all_views_see_is_true);
 	tcase_add_loop_test(truncated, a_body_that_is_spread_beyond_the_field_of_view_is_told, 0, 6);
 	tcase_add_loop_test(truncated, what_lies_outside_is_sought_about_an_axis_beside_the_origin, 0, 2);
