@@ -25,6 +25,8 @@ static const double STRENGTH = 0.6, UNSEEN = 0.2;
 enum { MEAN = 3, SPREAD = 3, SPREAD_SLICES = 2 };
 /* Slices at hand at a time, and those of them to either side that are only looked at. */
 enum { INNER = 24, MARGIN = 12, WINDOW = INNER + 2 * MARGIN };
+/* Columns beside each other that are asked at a time. */
+enum { CHUNK = 64 };
 /* Of the alternating direction method of multipliers, and the weight of its constraint. */
 enum { STEPS = 20 };
 static const double CONSTRAINT = 0.5;
@@ -277,38 +279,57 @@ static void away_of(const struct alternation *alternation, int count, int k, flo
 	const float *here = alternation->values + (size_t)k * pixels;
 	const float *before = k > 0 ? here - pixels : here, *behind = k + 1 < count ? here + pixels : here;
 
+#pragma omp parallel for simd schedule(static)
 	for (size_t i = 0; i < pixels; i++)
 		ret_away[i] = (2 * here[i] - before[i] - behind[i]) / 4;
 }
 
-/* The mean over voxels of a slice, or the most of them, first along x into `work` and then along y; the slice's edge
- * goes on. */
+/* Sums over MEAN to either side in a row that goes on as at its ends. */
+static void sum_row(const float *row, int columns, float *ret_sums)
+{
+	for (int x = 0; x < columns; x++) {
+		float sum = 0;
+
+		if (x >= MEAN && x < columns - MEAN)
+			continue;
+		for (int k = -MEAN; k <= MEAN; k++)
+			sum += row[held(x + k, columns)];
+		ret_sums[x] = sum;
+	}
+	for (int x = MEAN; x < columns - MEAN; x++) {
+		float sum = 0;
+
+		for (int k = -MEAN; k <= MEAN; k++)
+			sum += row[x + k];
+		ret_sums[x] = sum;
+	}
+}
+
+/* The mean over voxels of a slice, in place; beyond its edges it goes on as there. */
 static void mean_around(const struct alternation *alternation, float *slice)
 {
 	const int columns = alternation->size[0], rows = alternation->size[1];
+	const float share = 1.0f / ((2 * MEAN + 1) * (2 * MEAN + 1));
 	float *work = alternation->work;
 
 #pragma omp parallel for schedule(static)
 	for (int y = 0; y < rows; y++)
-		for (int x = 0; x < columns; x++) {
-			const float *row = slice + (size_t)y * (size_t)columns;
-			float sum = 0;
-
-			for (int k = -MEAN; k <= MEAN; k++)
-				sum += row[held(x + k, columns)];
-			work[(size_t)y * (size_t)columns + (size_t)x] = sum / (2 * MEAN + 1);
-		}
+		sum_row(slice + (size_t)y * (size_t)columns, columns, work + (size_t)y * (size_t)columns);
 #pragma omp parallel for schedule(static)
-	for (int y = 0; y < rows; y++)
-		for (int x = 0; x < columns; x++) {
-			float sum = 0;
+	for (int y = 0; y < rows; y++) {
+		float *row = slice + (size_t)y * (size_t)columns;
 
-			for (int k = -MEAN; k <= MEAN; k++)
-				sum += work[(size_t)held(y + k, rows) * (size_t)columns + (size_t)x];
-			slice[(size_t)y * (size_t)columns + (size_t)x] = sum / (2 * MEAN + 1);
+		memset(row, 0, (size_t)columns * sizeof(*row));
+		for (int k = -MEAN; k <= MEAN; k++) {
+			const float *beside = work + (size_t)held(y + k, rows) * (size_t)columns;
+
+			for (int x = 0; x < columns; x++)
+				row[x] += share * beside[x];
 		}
+	}
 }
 
+/* The most of the voxels around of a slice, in place. */
 static void most_around(const struct alternation *alternation, float *slice)
 {
 	const int columns = alternation->size[0], rows = alternation->size[1];
@@ -325,52 +346,74 @@ static void most_around(const struct alternation *alternation, float *slice)
 			work[(size_t)y * (size_t)columns + (size_t)x] = most;
 		}
 #pragma omp parallel for schedule(static)
-	for (int y = 0; y < rows; y++)
-		for (int x = 0; x < columns; x++) {
-			float most = 0;
+	for (int y = 0; y < rows; y++) {
+		float *row = slice + (size_t)y * (size_t)columns;
 
-			for (int k = -SPREAD; k <= SPREAD; k++)
-				most = fmaxf(most, work[(size_t)held(y + k, rows) * (size_t)columns + (size_t)x]);
-			slice[(size_t)y * (size_t)columns + (size_t)x] = most;
+		memset(row, 0, (size_t)columns * sizeof(*row));
+		for (int k = -SPREAD; k <= SPREAD; k++) {
+			const float *beside = work + (size_t)held(y + k, rows) * (size_t)columns;
+
+			for (int x = 0; x < columns; x++)
+				row[x] = beside[x] > row[x] ? beside[x] : row[x];
 		}
-}
-
-/* a of a column, from the means of A V there: the most of the threes that a slice or one near it is in. */
-static void column_alternates(float *column, size_t apart, int count)
-{
-	float away[WINDOW], most[WINDOW] = {0};
-
-	for (int k = 0; k < count; k++)
-		away[k] = column[(size_t)k * apart];
-	for (int k = 1; k + 1 < count; k++) {
-		const float least = fminf(fabsf(away[k]), fminf(fabsf(away[k - 1]), fabsf(away[k + 1])));
-
-		if (!(away[k - 1] * away[k] < 0 && away[k] * away[k + 1] < 0))
-			continue;
-		for (int i = held(k - 1 - SPREAD_SLICES, count); i <= held(k + 1 + SPREAD_SLICES, count); i++)
-			most[i] = fmaxf(most[i], least);
 	}
-	for (int k = 0; k < count; k++)
-		column[(size_t)k * apart] = most[k];
 }
 
-/* a of a stretch's voxels. */
-static void find_alternation(const struct alternation *alternation, const struct stretch *stretch)
+/*
+ * a of columns beside each other, from the means of A V there: the most of the threes that a slice or one near it is
+ * in. Returns whether any is more than the doubt.
+ */
+static bool columns_alternate(float *columns, int wide, size_t apart, int count, float doubt)
+{
+	float away[WINDOW][CHUNK], least[WINDOW][CHUNK] = {{0}};
+	bool any = false;
+
+	for (int k = 0; k < count; k++)
+		memcpy(away[k], columns + (size_t)k * apart, (size_t)wide * sizeof(float));
+	for (int k = 1; k + 1 < count; k++)
+		for (int x = 0; x < wide; x++) {
+			const float before = away[k - 1][x], here = away[k][x], behind = away[k + 1][x];
+			const float two = fabsf(before) < fabsf(behind) ? fabsf(before) : fabsf(behind);
+			const float three = fabsf(here) < two ? fabsf(here) : two;
+
+			least[k][x] = before * here < 0 && here * behind < 0 ? three : 0;
+			any = any || least[k][x] > doubt;
+		}
+	for (int k = 0; k < count; k++) {
+		float *most = columns + (size_t)k * apart;
+		const int last = held(k + 1 + SPREAD_SLICES, count);
+
+		memset(most, 0, (size_t)wide * sizeof(*most));
+		for (int i = held(k - 1 - SPREAD_SLICES, count); i <= last && any; i++)
+			for (int x = 0; x < wide; x++)
+				most[x] = least[i][x] > most[x] ? least[i][x] : most[x];
+	}
+	return any;
+}
+
+/* a of a stretch's voxels; false where nothing alternates by more than the doubt. */
+static bool find_alternation(const struct alternation *alternation, const struct stretch *stretch)
 {
 	const int columns = alternation->size[0], rows = alternation->size[1];
 	const size_t pixels = pixels_of(alternation->size);
+	const float doubt = (float)(DOUBT * alternation->mu_water / 2);
+	bool any = false;
 
 	for (int k = 0; k < stretch->count; k++) {
 		away_of(alternation, stretch->count, k, alternation->found + (size_t)k * pixels);
 		mean_around(alternation, alternation->found + (size_t)k * pixels);
 	}
-#pragma omp parallel for schedule(static)
+#pragma omp parallel for schedule(static) reduction(|| : any)
 	for (int y = 0; y < rows; y++)
-		for (int x = 0; x < columns; x++)
-			column_alternates(alternation->found + (size_t)y * (size_t)columns + (size_t)x, pixels,
-					  stretch->count);
-	for (int k = 0; k < stretch->count; k++)
+		for (int x = 0; x < columns; x += CHUNK) {
+			float *at = alternation->found + (size_t)y * (size_t)columns + (size_t)x;
+			const int wide = columns - x < CHUNK ? columns - x : CHUNK;
+
+			any = columns_alternate(at, wide, pixels, stretch->count, doubt) || any;
+		}
+	for (int k = 0; k < stretch->count && any; k++)
 		most_around(alternation, alternation->found + (size_t)k * pixels);
+	return any;
 }
 
 /* ---- a column ---- */
@@ -550,7 +593,8 @@ static int show_stretch(struct alternation *alternation, const struct stretch *s
 
 	if (code < 0)
 		return code;
-	find_alternation(alternation, stretch);
+	if (!find_alternation(alternation, stretch))
+		return 0;
 	settle(alternation, stretch);
 	for (int z = stretch->first; z < stretch->last && code == 0; z++) {
 		const size_t k = (size_t)(z - stretch->begin);

@@ -20,11 +20,16 @@
  * taken out; of all columns along z that look nearly the same to the views, the one is kept whose values vary least:
  *
  *   V' = argmin  1/2 (x - U)' H (x - U) + sum over neighbours of L |x_k+1 - x_k|
- *   H = 1 - w A,  A = (-1, 2, -1) / 4 along z,  w = 1 - visibility: H is 1 for what is even, and the visibility for
- * what alternates, as A' A of the rays is U = V - u A V,  u = g max(0, 1 - visibility / .2),  L = .6 w (1 - u) g a g =
- * e^2 / (e^2 + T^2 / 4),  e = max(a - T / 2, 0), T = 20 HU a = the least of |A V| in three slices in a row where it
- * changes its sign twice, of means over 7 x 7 voxels of the slice; the most of these threes and of two slices and three
- * voxels around
+ *
+ *   H = 1 - w A,  A = (-1, 2, -1) / 4 along z,  w = 1 - visibility
+ *
+ *   U = V - u A V,  u = g max(0, 1 - visibility / .2),  L = .6 w (1 - u) g a
+ *
+ *   g = e^2 / (e^2 + T^2 / 4),  e = max(a - T / 2, 0),  T = 20 HU
+ *
+ * H is 1 for what is even, and the visibility for what alternates, as A' A of the rays is. a is the least of |A V| in
+ * three slices in a row where it changes its sign twice, of means over 7 x 7 voxels of the slice; the most of these
+ * threes and of two slices and three voxels around.
  *
  * An edge has one such change of sign, so that a is 0 nearly everywhere, and V' = V to the bit.
  *
