@@ -61,10 +61,11 @@ struct input {
 	int copy_count;
 	int good[2]; /* the last view that input_copy did not copy, and the one before it; -1: none */
 	/*
-	 * Rows of blank views that the filter had counted as cut off before it was known that they show nothing: in all
-	 * that it has counted they are twice, since they are filtered once more when they are taken out.
+	 * Rows that the filter has counted as cut off and that are none more: twice those of blank views which it had
+	 * before it was known that they show nothing, since they are filtered once more when they are taken out, and
+	 * those of views that were filtered once more for a volume of every other view.
 	 */
-	size_t cut_blank[2];
+	size_t cut_again[2];
 	bool even;                    /* no view shows an object; of those that have come, until all have */
 	struct view_content *content; /* [views of the scan], owned */
 	size_t pixels;                /* of a view */

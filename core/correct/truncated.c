@@ -66,9 +66,9 @@ static int apply(const struct correction_job *job, void *state, enum correction_
 	(void)time;
 	(void)ret_changed;
 	for (int side = 0; side < 2 && code == 0; side++) {
-		const size_t twice = 2 * job->input->cut_blank[side];
+		const size_t again = job->input->cut_again[side];
 
-		rows[side] -= twice < rows[side] ? twice : rows[side];
+		rows[side] -= again < rows[side] ? again : rows[side];
 	}
 	if (code == 0)
 		truncated_warn(job, rows, job->extend);

@@ -181,8 +181,12 @@ static size_t kept_bytes(const struct recon *recon)
 		bytes += ends_bytes(&recipe->grid, recon->geometry, &recon->orbit);
 	if (recipe_has_rim(recipe, &recon->orbit))
 		bytes += rim_bytes(&recipe->grid, &recon->orbit);
-	if (recipe_has_restraint(recipe, &recon->orbit))
-		bytes += restraint_bytes(&recipe->grid);
+	if (recipe_has_restraint(recipe, &recon->orbit)) {
+		const struct edge_blur edges =
+		    edges_blur(&recipe->grid, &recon->orbit, recipe->fdk.window, recipe->fdk.cutoff);
+
+		bytes += restraint_bytes(&recipe->grid, &edges);
+	}
 	if (recipe->algorithm != NULL)
 		bytes += alternation_bytes(&recipe->grid);
 	if (thin_width(recipe, &recon->orbit) > 0)

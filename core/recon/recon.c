@@ -175,11 +175,15 @@ static int open_restraint(struct recon *recon, struct error *err)
 {
 	const struct recipe *recipe = &recon->recipe;
 	const struct edge_blur edges = edges_blur(&recipe->grid, &recon->orbit, recipe->fdk.window, recipe->fdk.cutoff);
+	int code;
 
 	if (!recipe_has_restraint(recipe, &recon->orbit))
 		return 0;
-	return restraint_new(&recipe->grid, recipe->mu_water, recon->orbit.pixel_at_isocentre[0], &edges,
+	code = restraint_new(&recipe->grid, recipe->mu_water, recon->orbit.pixel_at_isocentre[0], &edges,
 			     recipe->iterate.nonnegative, &recon->restraint, err);
+	if (restraint_has_edges(recon->restraint))
+		recon->work_total += WORK_FDK / 2;
+	return code;
 }
 
 /* The views of a recipe that refines the geometry, and the time that it takes. */
@@ -494,7 +498,7 @@ static size_t rim_part(const struct recon *recon, size_t size, bool *ret_fits)
 	const struct grid *grid = &recon->recipe.grid;
 	const size_t whole = state_without_start(recon);
 	const size_t rim = recon->rim != NULL ? rim_bytes(grid, &recon->orbit) : 0;
-	const size_t start = recon->restraint != NULL ? restraint_kept_bytes(grid) : 0;
+	const size_t start = recon->restraint != NULL ? restraint_kept_bytes(recon->restraint) : 0;
 	const bool has_rim = size == whole + rim || size == whole + rim + start;
 
 	*ret_fits = has_rim || size == whole || size == whole + start;

@@ -1,14 +1,15 @@
 /* How far the default's iterations are followed: see restraint.h. */
 #include "core/recon/restraint.h"
 
+#include <limits.h>
 #include <math.h>
 #include <stdlib.h>
 #include <string.h>
 
 #include "core/recon/restraint_places.h"
 
-/* Voxels a side of a cube; so many cubes say something. */
-enum { CELL = PLACE_CELL, CELLS_LEAST = 16 };
+/* Voxels a side of a cube; so many cubes say something, so many across. */
+enum { CELL = PLACE_CELL, CELLS_LEAST = 16, ACROSS_LEAST = 4 };
 /* Layers of cubes that are asked for their roughness, at most: the others are left out evenly. */
 enum { LAYERS_MOST = 24 };
 /* c beside the volume there, in thousandths; and the noise that values differ by anyway, for a, HU. */
@@ -35,16 +36,16 @@ struct node {
 
 struct restraint {
 	struct grid grid;
-	double mu_water, blur; /* 1/mm; of FDK, mm */
+	double mu_water, blur, most; /* 1/mm; of FDK, mm; of S, times water */
 	struct edge_blur edges;
 	bool nonnegative;
 	int cells[3];
 	size_t slice, voxels;
-	float *start;       /* [z][y][x], S, owned; in between what TV took; NULL before either is known */
-	signed char *limit; /* [z][y][x], behind start: what an iterate gets back at most, with its sign */
-	bool lost, begun;   /* TV took something; S is there */
-	bool metal;         /* S has voxels as dense as metal */
-	bool holds_dense;   /* what is very dense stays as S has it */
+	float *start;         /* [z][y][x], S, owned; in between what TV took; NULL before either is known */
+	signed char *limit;   /* [z][y][x], behind start: what an iterate gets back at most, with its sign */
+	unsigned char *noise; /* [z][y][x], behind limit, where there are edges: FDK's (edges_see) */
+	bool lost, begun;     /* TV took something; S is there */
+	bool holds_dense;     /* what is very dense stays as S has it */
 };
 
 static size_t cells_of(const struct grid *grid)
@@ -58,18 +59,24 @@ static size_t nodes_of(const struct grid *grid)
 	       (size_t)(grid->size[2] / CELL + 1);
 }
 
-size_t restraint_kept_bytes(const struct grid *grid)
+static size_t kept_bytes(const struct grid *grid, const struct edge_blur *edges)
 {
-	return grid_voxels(grid) * (sizeof(float) + sizeof(signed char));
+	return grid_voxels(grid) * (sizeof(float) + sizeof(signed char) + (edges->share > 0 ? 1 : 0));
 }
 
-size_t restraint_bytes(const struct grid *grid)
+size_t restraint_kept_bytes(const struct restraint *restraint)
+{
+	return kept_bytes(&restraint->grid, &restraint->edges);
+}
+
+size_t restraint_bytes(const struct grid *grid, const struct edge_blur *edges)
 {
 	const size_t slice = (size_t)grid->size[0] * (size_t)grid->size[1];
+	const int across = CELL * (edges->share > 0 ? 2 : ACROSS_LEAST);
 
-	if (grid->size[0] < 4 * CELL || grid->size[1] < 4 * CELL || grid->size[2] < CELL)
+	if (grid->size[0] < across || grid->size[1] < across || grid->size[2] < CELL)
 		return 0;
-	return restraint_kept_bytes(grid) + cells_of(grid) * (sizeof(struct cell) + sizeof(float)) +
+	return kept_bytes(grid, edges) + cells_of(grid) * (sizeof(struct cell) + sizeof(float)) +
 	       nodes_of(grid) * sizeof(struct node) + 2 * slice * sizeof(float) + places_bytes(grid) +
 	       edges_bytes(grid);
 }
@@ -80,7 +87,7 @@ int restraint_new(const struct grid *grid, double mu_water, double blur, const s
 	struct restraint *restraint;
 
 	*ret_restraint = NULL;
-	if (restraint_bytes(grid) == 0)
+	if (restraint_bytes(grid, edges) == 0)
 		return 0;
 	restraint = malloc(sizeof(*restraint));
 	if (restraint == NULL)
@@ -101,7 +108,7 @@ int restraint_new(const struct grid *grid, double mu_water, double blur, const s
 
 bool restraint_has_edges(const struct restraint *restraint)
 {
-	return restraint->edges.share > 0;
+	return restraint != NULL && restraint->edges.share > 0;
 }
 
 void restraint_free(struct restraint *restraint)
@@ -112,16 +119,31 @@ void restraint_free(struct restraint *restraint)
 	free(restraint);
 }
 
-/* All of it 0. */
+/* All of it 0, and so much noise that edges stay. */
 static int make_room(struct restraint *restraint, struct error *err)
 {
 	if (restraint->start != NULL)
 		return 0;
-	restraint->start = calloc(1, restraint_kept_bytes(&restraint->grid));
+	restraint->start = calloc(1, restraint_kept_bytes(restraint));
 	if (restraint->start == NULL)
 		return error_set(err, ERR_NO_MEMORY, "no memory for a start of %zu voxels", restraint->voxels);
 	restraint->limit = (signed char *)(restraint->start + restraint->voxels);
+	restraint->noise = (unsigned char *)restraint->limit + restraint->voxels;
+	if (restraint_has_edges(restraint))
+		memset(restraint->noise, UCHAR_MAX, restraint->voxels);
 	return 0;
+}
+
+int restraint_see_halves(struct restraint *restraint, const struct edge_halves *halves, struct error *err)
+{
+	int code = make_room(restraint, err);
+
+	if (code == 0)
+		code = edges_see(&restraint->edges, &restraint->grid, restraint->mu_water, halves, restraint->start,
+				 restraint->noise, err);
+	if (code == 0)
+		memset(restraint->start, 0, restraint->voxels * sizeof(*restraint->start));
+	return code;
 }
 
 /* ---- sums over cubes ---- */
@@ -378,15 +400,14 @@ int restraint_see_loss(struct restraint *restraint, const struct backend *backen
 	return code;
 }
 
-static void look_for_metal(struct restraint *restraint)
+static void find_most(struct restraint *restraint)
 {
-	const float metal = (float)(RESTRAINT_METAL * restraint->mu_water);
-	bool found = false;
+	float most = 0;
 
-#pragma omp parallel for schedule(static) reduction(|| : found)
+#pragma omp parallel for schedule(static) reduction(max : most)
 	for (size_t i = 0; i < restraint->voxels; i++)
-		found = found || restraint->start[i] >= metal;
-	restraint->metal = found;
+		most = fmaxf(most, restraint->start[i]);
+	restraint->most = (double)most / restraint->mu_water;
 }
 
 int restraint_begin(struct restraint *restraint, const struct backend *backend, struct volume *volume,
@@ -407,7 +428,7 @@ int restraint_begin(struct restraint *restraint, const struct backend *backend, 
 	}
 	restraint->begun = code == 0;
 	if (restraint->begun)
-		look_for_metal(restraint);
+		find_most(restraint);
 	free(slice);
 	return code;
 }
@@ -416,7 +437,7 @@ int restraint_begin(struct restraint *restraint, const struct backend *backend, 
 
 size_t restraint_state_bytes(const struct restraint *restraint)
 {
-	return restraint != NULL && restraint->begun ? restraint_kept_bytes(&restraint->grid) : 0;
+	return restraint != NULL && restraint->begun ? restraint_kept_bytes(restraint) : 0;
 }
 
 const void *restraint_state(const struct restraint *restraint)
@@ -430,10 +451,10 @@ int restraint_resume(struct restraint *restraint, const char *bytes, struct erro
 
 	if (code < 0)
 		return code;
-	memcpy(restraint->start, bytes, restraint_kept_bytes(&restraint->grid));
+	memcpy(restraint->start, bytes, restraint_kept_bytes(restraint));
 	for (size_t i = 0; i < restraint->voxels && !restraint->lost; i++)
 		restraint->lost = restraint->limit[i] != 0;
-	look_for_metal(restraint);
+	find_most(restraint);
 	restraint->begun = true;
 	return 0;
 }
@@ -596,7 +617,7 @@ static int find_places(const struct restraint *restraint, struct showing *showin
 		       struct places **ret_places, struct error *err)
 {
 	const int step = (restraint->cells[2] - 1) / LAYERS_MOST + 1;
-	bool wanted = restraint->metal || restraint->holds_dense || report->share < 1;
+	bool wanted = restraint->most >= RESTRAINT_METAL || restraint->holds_dense || report->share < 1;
 	struct places *places;
 	double rougher = 0;
 	int code = places_new(&restraint->grid, restraint->mu_water, restraint->blur, &places, err);
@@ -620,49 +641,60 @@ static int find_places(const struct restraint *restraint, struct showing *showin
 	return 0;
 }
 
-int restraint_show(struct restraint *restraint, const struct backend *backend, struct volume *volume, bool is_fdk,
-		   const struct correction_chain *dense, struct restraint_report *ret_report, struct error *err)
+/* V is held back. */
+static int follow(struct restraint *restraint, struct showing *showing, struct restraint_report *report,
+		  struct error *err)
 {
 	const int step = restraint->lost ? 1 : (restraint->cells[2] - 1) / LAYERS_MOST + 1;
-	struct restraint_report report = {.share = 1};
 	struct scratch scratch;
-	struct pair pair = {backend, volume, NULL, NULL};
-	struct showing showing = {.backend = backend, .volume = volume, .dense = dense};
 	struct places *places = NULL;
-	int code = restraint->begun ? scratch_new(restraint, &scratch, err) : 0;
+	struct pair pair = {showing->backend, showing->volume, NULL, NULL};
+	int code = scratch_new(restraint, &scratch, err);
 
-	*ret_report = report;
-	if (code < 0 || !restraint->begun)
+	if (code < 0)
 		return code;
-	pair.slices = showing.slice = scratch.slices;
+	pair.slices = showing->slice = scratch.slices;
 	code = add_layers(restraint, &pair, step, scratch.cells, err);
 	if (code == 0)
-		find_share(restraint, scratch.cells, scratch.scores, &report);
-	report.share = places_kept(report.share);
-	restraint->holds_dense = dense != NULL;
-	report.changed = report.share < 1 || restraint->lost || restraint->holds_dense;
+		find_share(restraint, scratch.cells, scratch.scores, report);
+	report->share = places_kept(report->share);
+	report->changed = report->share < 1 || restraint->lost || restraint->holds_dense;
 	if (code == 0 && restraint->lost) {
 		make_nodes(restraint, scratch.cells, scratch.nodes);
-		showing.nodes = scratch.nodes;
+		showing->nodes = scratch.nodes;
 	}
 	if (code == 0)
-		code = find_places(restraint, &showing, &report, &places, err);
-	for (int z = 0; z < restraint->grid.size[2] && code == 0 && report.changed; z++) {
-		code = read_slice(restraint, &showing, z, &report, err);
+		code = find_places(restraint, showing, report, &places, err);
+	for (int z = 0; z < restraint->grid.size[2] && code == 0 && report->changed; z++) {
+		code = read_slice(restraint, showing, z, report, err);
 		if (code == 0) {
-			hold_back(restraint, places, report.share, z, showing.slice);
-			code = backend->volume_put(volume, z, 1, showing.slice, err);
+			hold_back(restraint, places, report->share, z, showing->slice);
+			code = showing->backend->volume_put(showing->volume, z, 1, showing->slice, err);
 		}
 	}
 	places_free(places);
 	scratch_free(&scratch);
-	if (code == 0 && restraint_has_edges(restraint) && is_fdk && !restraint->metal && !restraint->holds_dense) {
-		report.changed = true;
-		code = edges_show(&restraint->edges, &restraint->grid, restraint->mu_water, restraint->nonnegative,
-				  restraint->start, backend, volume, err);
-	}
-	report.restored = showing.counts[0] > 0 ? (double)showing.counts[1] / (double)showing.counts[0] : 0;
-	if (code == 0)
-		*ret_report = report;
 	return code;
+}
+
+int restraint_show(struct restraint *restraint, const struct backend *backend, struct volume *volume, bool held,
+		   const struct correction_chain *dense, struct restraint_report *ret_report, struct error *err)
+{
+	struct showing showing = {.backend = backend, .volume = volume, .dense = dense};
+	int code = 0;
+
+	*ret_report = (struct restraint_report){.share = 1};
+	if (!restraint->begun)
+		return 0;
+	restraint->holds_dense = dense != NULL;
+	held = held || restraint->most >= RESTRAINT_DENSE || !restraint_has_edges(restraint);
+	if (held && restraint->cells[0] >= ACROSS_LEAST && restraint->cells[1] >= ACROSS_LEAST)
+		code = follow(restraint, &showing, ret_report, err);
+	if (showing.counts[0] > 0)
+		ret_report->restored = (double)showing.counts[1] / (double)showing.counts[0];
+	if (code < 0 || !restraint_has_edges(restraint) || restraint->most >= RESTRAINT_METAL || restraint->holds_dense)
+		return code;
+	ret_report->changed = true;
+	return edges_show(&restraint->edges, &restraint->grid, restraint->mu_water, restraint->nonnegative,
+			  restraint->start, restraint->noise, backend, volume, err);
 }

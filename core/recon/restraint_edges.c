@@ -3,18 +3,18 @@
 
 #include <math.h>
 #include <stdlib.h>
+#include <string.h>
 
 #include "core/recon/restraint_places.h"
 
-enum { CELL = PLACE_CELL };
 /* FDK's variance in those of a voxel: up to the first all is done, nothing from the second on. */
 static const double WHOLE = 1.5, NONE = 2;
-/* Share of water: the object. */
-static const double OBJECT = 0.7;
-/* m^2 is over so many voxels to either side. */
+/* V has noise of its own, and s^2 is known from a few voxels: it counts so many times. */
+static const float SURE = 4;
+/* m^2 and s^2 are over so many voxels to either side. */
 enum { BESIDE = 1 };
-/* Of so many even voxels a cube says something. */
-static const float LEAST = 1;
+/* s is kept in a byte: so many steps double it, and the first one is so many HU. */
+static const float STEPS = 16, FIRST = 0.25f;
 
 /* Of a filter that is W(f) beside the ramp: -W'' at 0, f in radians a pixel, which is its variance in pixels' squares.
  */
@@ -46,26 +46,14 @@ struct edge_blur edges_blur(const struct grid *grid, const struct orbit *orbit, 
 	return blur;
 }
 
-/* Sums over a cube's even voxels: of u, and of u D^2; then s^2, below 0 where there are none. */
-struct cube {
-	float even, square;
-};
-
 struct edges {
 	const struct edge_blur *blur;
 	const struct grid *grid;
-	const float *start;
+	const float *start; /* S, or E */
+	const unsigned char *noise;
 	float mu_water;
-	int cells[3], reach[2];
-	struct cube *cubes; /* [z][y][x], owned */
-	float *most;        /* [z][y][x] of cubes, owned: s^2, of the cubes beside it the most */
-	float *slices;      /* [3][y][x], owned: V, D, and sums of D^2 along x */
+	float *slices; /* [3][y][x], owned: V, D, and sums of D^2 along x */
 };
-
-static size_t cells_of(const struct grid *grid)
-{
-	return (size_t)(grid->size[0] / CELL) * (size_t)(grid->size[1] / CELL) * (size_t)(grid->size[2] / CELL);
-}
 
 static size_t pixels_of(const struct grid *grid)
 {
@@ -74,7 +62,15 @@ static size_t pixels_of(const struct grid *grid)
 
 size_t edges_bytes(const struct grid *grid)
 {
-	return cells_of(grid) * (sizeof(struct cube) + sizeof(float)) + 3 * pixels_of(grid) * sizeof(float);
+	return 3 * pixels_of(grid) * sizeof(float);
+}
+
+static int open_edges(struct edges *edges, struct error *err)
+{
+	edges->slices = calloc(3 * pixels_of(edges->grid), sizeof(*edges->slices));
+	return edges->slices != NULL
+		   ? 0
+		   : error_set(err, ERR_NO_MEMORY, "no memory for the edges of %zu pixels", pixels_of(edges->grid));
 }
 
 /* T at a voxel; beyond the grid's ends S goes on as it is there. */
@@ -110,99 +106,6 @@ static void differ(const struct edges *edges, int z)
 		}
 }
 
-static float evenness(const struct edges *edges, int x, int y)
-{
-	return place_evenness(edges->grid->size, edges->reach, edges->mu_water, edges->slices, x, y);
-}
-
-static void add_slice(const struct edges *edges, int z)
-{
-	const int across = edges->cells[0], columns = edges->grid->size[0];
-	const float *differences = edges->slices + pixels_of(edges->grid);
-	struct cube *layer = edges->cubes + (ptrdiff_t)(z / CELL) * across * edges->cells[1];
-
-	if (z / CELL >= edges->cells[2])
-		return;
-#pragma omp parallel for schedule(static)
-	for (int block = 0; block < edges->cells[1]; block++)
-		for (int y = block * CELL; y < (block + 1) * CELL; y++)
-			for (int x = 0; x < across * CELL; x++) {
-				const ptrdiff_t at = (ptrdiff_t)y * columns + x;
-				const bool object = edges->slices[at] > (float)OBJECT * edges->mu_water;
-				const float even = object ? evenness(edges, x, y) : 0, difference = differences[at];
-				struct cube *cube = layer + (ptrdiff_t)block * across + x / CELL;
-
-				cube->even += even;
-				cube->square += even * difference * difference;
-			}
-}
-
-static float most_beside(const struct edges *edges, int x, int y, int z)
-{
-	const int at[3] = {x, y, z}, *count = edges->cells;
-	int first[3], last[3];
-	float most = -1;
-
-	for (int axis = 0; axis < 3; axis++) {
-		first[axis] = at[axis] > 0 ? at[axis] - 1 : 0;
-		last[axis] = at[axis] + 1 < count[axis] ? at[axis] + 1 : count[axis] - 1;
-	}
-	for (int k = first[2]; k <= last[2]; k++)
-		for (int j = first[1]; j <= last[1]; j++)
-			for (int i = first[0]; i <= last[0]; i++)
-				most = fmaxf(most, edges->cubes[((ptrdiff_t)k * count[1] + j) * count[0] + i].square);
-	return most;
-}
-
-/* s^2; where no cube beside it is even, that of the worst place. False: none is even. */
-static bool find_most(const struct edges *edges)
-{
-	const int *count = edges->cells;
-	const size_t cubes = cells_of(edges->grid);
-	float worst = -1;
-
-	for (size_t i = 0; i < cubes; i++) {
-		struct cube *cube = &edges->cubes[i];
-
-		cube->square = cube->even > LEAST ? cube->square / cube->even : -1;
-		worst = fmaxf(worst, cube->square);
-	}
-#pragma omp parallel for schedule(static)
-	for (int z = 0; z < count[2]; z++)
-		for (int y = 0; y < count[1]; y++)
-			for (int x = 0; x < count[0]; x++) {
-				const float most = most_beside(edges, x, y, z);
-
-				edges->most[((ptrdiff_t)z * count[1] + y) * count[0] + x] = most < 0 ? worst : most;
-			}
-	return worst >= 0;
-}
-
-/* s^2 of a voxel, linear between the middles of cubes. */
-static float spread_at(const struct edges *edges, int x, int y, int z)
-{
-	const int at[3] = {x, y, z}, *count = edges->cells;
-	int first[3];
-	float share[3], sum = 0;
-
-	for (int axis = 0; axis < 3; axis++)
-		first[axis] = place_between(at[axis], count[axis], &share[axis]);
-	for (int corner = 0; corner < 8; corner++) {
-		int place[3];
-		float weight = 1;
-
-		for (int axis = 0; axis < 3; axis++) {
-			const int second = corner >> axis & 1;
-
-			place[axis] = first[axis] + second;
-			weight *= second ? share[axis] : 1 - share[axis];
-		}
-		if (weight > 0)
-			sum += weight * edges->most[((ptrdiff_t)place[2] * count[1] + place[1]) * count[0] + place[0]];
-	}
-	return sum;
-}
-
 static void sum_along_rows(const struct edges *edges)
 {
 	const int columns = edges->grid->size[0], rows = edges->grid->size[1];
@@ -224,7 +127,7 @@ static void sum_along_rows(const struct edges *edges)
 		}
 }
 
-/* m^2, beyond the grid's sides as it is there. */
+/* The mean of D^2, beyond the grid's sides as it is there. */
 static float square_at(const struct edges *edges, int x, int y)
 {
 	const int columns = edges->grid->size[0], rows = edges->grid->size[1];
@@ -239,73 +142,106 @@ static float square_at(const struct edges *edges, int x, int y)
 	return sum / ((2 * BESIDE + 1) * (2 * BESIDE + 1));
 }
 
+/* s^2 of a voxel. */
+static float spread_of(const struct edges *edges, unsigned char noise)
+{
+	const float hu = FIRST * exp2f((float)noise / STEPS), s = hu * edges->mu_water / 1000;
+
+	return s * s;
+}
+
+static unsigned char noise_of(const struct edges *edges, float spread)
+{
+	const float hu = sqrtf(spread) * 1000 / edges->mu_water;
+
+	return (unsigned char)fminf(255, fmaxf(0, roundf(STEPS * log2f(hu / FIRST))));
+}
+
+/* A is what `part` of the views make, and B what the others make, each as much as all of them: E is (A - B) / 2. */
+static int subtract(struct edges *edges, const struct edge_halves *halves, float *ret_halves, struct error *err)
+{
+	const float own = (float)(.5 / halves->part + .5 / (1 - halves->part)), all = (float)(.5 / (1 - halves->part));
+	const size_t pixels = pixels_of(edges->grid);
+	int code = 0;
+
+	for (int z = 0; z < edges->grid->size[2] && code == 0; z++) {
+		float *values = ret_halves + (size_t)z * pixels;
+
+		code = halves->backend->volume_download(halves->half, z, 1, values, err);
+		if (code == 0)
+			code = halves->backend->volume_download(halves->all, z, 1, edges->slices, err);
+		for (size_t i = 0; i < pixels && code == 0; i++)
+			values[i] = own * values[i] - all * edges->slices[i];
+	}
+	memset(edges->slices, 0, pixels * sizeof(*edges->slices));
+	return code;
+}
+
+int edges_see(const struct edge_blur *blur, const struct grid *grid, double mu_water, const struct edge_halves *halves,
+	      float *work, unsigned char *ret_noise, struct error *err)
+{
+	struct edges edges = {.blur = blur, .grid = grid, .start = work, .mu_water = (float)mu_water};
+	const int columns = grid->size[0], rows = grid->size[1];
+	int code = open_edges(&edges, err);
+
+	if (code == 0)
+		code = subtract(&edges, halves, work, err);
+	/* The slice V is 0, so that D is E. */
+	for (int z = 0; z < grid->size[2] && code == 0; z++) {
+		unsigned char *noise = ret_noise + (size_t)z * pixels_of(grid);
+
+		differ(&edges, z);
+		sum_along_rows(&edges);
+#pragma omp parallel for schedule(static)
+		for (int y = 0; y < rows; y++)
+			for (int x = 0; x < columns; x++)
+				noise[(ptrdiff_t)y * columns + x] = noise_of(&edges, square_at(&edges, x, y));
+	}
+	free(edges.slices);
+	return code;
+}
+
 /* V' of a slice, in the place of D. */
 static void mend_slice(const struct edges *edges, int z, bool nonnegative)
 {
+	/* Here FDK's blur is at most as wide as a voxel. */
+	static const int reach[2] = {PLACE_REACH, PLACE_REACH};
 	const int columns = edges->grid->size[0], rows = edges->grid->size[1];
 	const float *values = edges->slices;
 	float *differences = edges->slices + pixels_of(edges->grid);
+	const unsigned char *noise = edges->noise + (size_t)z * pixels_of(edges->grid);
 
 	sum_along_rows(edges);
 #pragma omp parallel for schedule(static)
 	for (int y = 0; y < rows; y++)
 		for (int x = 0; x < columns; x++) {
 			const ptrdiff_t at = (ptrdiff_t)y * columns + x;
-			const float spread = spread_at(edges, x, y, z), square = square_at(edges, x, y);
+			const float spread = spread_of(edges, noise[at]), square = square_at(edges, x, y);
 			float value = values[at];
 
-			if (square > spread)
-				value += edges->blur->share * (1 - evenness(edges, x, y)) * 0.5f *
-					 (1 - spread / square) * differences[at];
+			if (square > SURE * spread)
+				value += edges->blur->share *
+					 (1 - place_evenness(edges->grid->size, reach, edges->mu_water, values, x, y)) *
+					 0.5f * (1 - SURE * spread / square) * differences[at];
 			differences[at] = nonnegative ? fmaxf(value, 0) : value;
 		}
 }
 
-static int read_slice(const struct edges *edges, const struct backend *backend, struct volume *volume, int z,
-		      struct error *err)
-{
-	int code = backend->volume_download(volume, z, 1, edges->slices, err);
-
-	if (code == 0)
-		differ(edges, z);
-	return code;
-}
-
-static void edges_clear(struct edges *edges)
-{
-	free(edges->cubes);
-	free(edges->most);
-	free(edges->slices);
-}
-
 int edges_show(const struct edge_blur *blur, const struct grid *grid, double mu_water, bool nonnegative,
-	       const float *start, const struct backend *backend, struct volume *volume, struct error *err)
+	       const float *start, const unsigned char *noise, const struct backend *backend, struct volume *volume,
+	       struct error *err)
 {
-	struct edges edges = {.blur = blur, .grid = grid, .start = start, .mu_water = (float)mu_water};
-	int code = 0;
+	struct edges edges = {.blur = blur, .grid = grid, .start = start, .noise = noise, .mu_water = (float)mu_water};
+	int code = open_edges(&edges, err);
 
-	for (int axis = 0; axis < 3; axis++)
-		edges.cells[axis] = grid->size[axis] / CELL;
-	/* Here FDK's blur is at most as wide as a voxel. */
-	edges.reach[0] = edges.reach[1] = PLACE_REACH;
-	edges.cubes = calloc(cells_of(grid), sizeof(*edges.cubes));
-	edges.most = malloc(cells_of(grid) * sizeof(*edges.most));
-	edges.slices = malloc(3 * pixels_of(grid) * sizeof(*edges.slices));
-	if (edges.cubes == NULL || edges.most == NULL || edges.slices == NULL)
-		code = error_set(err, ERR_NO_MEMORY, "no memory for the edges of %zu cubes", cells_of(grid));
 	for (int z = 0; z < grid->size[2] && code == 0; z++) {
-		code = read_slice(&edges, backend, volume, z, err);
-		if (code == 0)
-			add_slice(&edges, z);
+		code = backend->volume_download(volume, z, 1, edges.slices, err);
+		if (code < 0)
+			break;
+		differ(&edges, z);
+		mend_slice(&edges, z, nonnegative);
+		code = backend->volume_put(volume, z, 1, edges.slices + pixels_of(grid), err);
 	}
-	if (code == 0 && find_most(&edges))
-		for (int z = 0; z < grid->size[2] && code == 0; z++) {
-			code = read_slice(&edges, backend, volume, z, err);
-			if (code < 0)
-				break;
-			mend_slice(&edges, z, nonnegative);
-			code = backend->volume_put(volume, z, 1, edges.slices + pixels_of(grid), err);
-		}
-	edges_clear(&edges);
+	free(edges.slices);
 	return code;
 }

@@ -206,7 +206,7 @@ static int restore_view(struct recon *recon, int view, int slot, struct error *e
 static int take_back(struct recon *recon, const int *views, int count, struct error *err)
 {
 	const struct backend *backend = recon->backend;
-	size_t cut[2] = {0}, *cut_blank = recon->input.cut_blank;
+	size_t cut[2] = {0}, cut_then[2] = {0};
 	int code = fdk_flush(&recon->fdk, recon->projections, recon->volume, err);
 
 	if (code == 0)
@@ -225,9 +225,9 @@ static int take_back(struct recon *recon, const int *views, int count, struct er
 	if (code == 0)
 		code = fdk_flush(&recon->fdk, recon->projections, recon->volume, err);
 	if (code == 0)
-		code = backend->filter_extended(recon->plan, cut_blank, err);
+		code = backend->filter_extended(recon->plan, cut_then, err);
 	for (int side = 0; side < 2 && code == 0; side++)
-		cut_blank[side] -= cut[side];
+		recon->input.cut_again[side] += 2 * (cut_then[side] - cut[side]);
 	return code == 0 ? backend->volume_axpby(-1, recon->volume, 0, recon->volume, err) : code;
 }
 
@@ -343,6 +343,44 @@ static int smooth_fdk(struct recon *recon, struct error *err)
 		   : code;
 }
 
+/* A view that has no part in the FDK volume is a blank one, or one that is held out. */
+static bool in_fdk(const struct recon *recon, int view)
+{
+	for (int i = 0; i < recon->input.counts.blank; i++)
+		if (recon->input.blank[i] == view)
+			return false;
+	return true;
+}
+
+/* FDK of every other view, in `before`, says how noisy the FDK volume is (restraint_edges.h). */
+static int see_halves(struct recon *recon, struct error *err)
+{
+	const struct backend *backend = recon->backend;
+	size_t cut[2] = {0}, cut_then[2] = {0};
+	int all = 0, taken = 0, code = backend->filter_extended(recon->plan, cut, err);
+
+	recon->work_done += WORK_FDK / 2;
+	if (code == 0)
+		code = backend->volume_fill(recon->before, 0, err);
+	for (int view = 0; view < recon->geometry->count && code == 0; view++) {
+		if (!in_fdk(recon, view) || all++ % 2 == 0)
+			continue;
+		taken++;
+		code = fdk_add(&recon->fdk, view, view, recon->projections, recon->before, err);
+	}
+	if (code == 0)
+		code = fdk_flush(&recon->fdk, recon->projections, recon->before, err);
+	if (code == 0)
+		code = backend->filter_extended(recon->plan, cut_then, err);
+	for (int side = 0; side < 2 && code == 0; side++)
+		recon->input.cut_again[side] += cut_then[side] - cut[side];
+	if (code < 0 || taken == 0)
+		return code;
+	return restraint_see_halves(
+	    recon->restraint, &(struct edge_halves){backend, recon->volume, recon->before, (double)taken / (double)all},
+	    err);
+}
+
 /* The FDK volume and what is made of it before the first iteration. */
 static int finish_fdk(struct recon *recon, struct error *err)
 {
@@ -355,6 +393,8 @@ static int finish_fdk(struct recon *recon, struct error *err)
 		code = error_set(err, ERR_IMPOSSIBLE,
 				 "%zu voxels of the FDK volume are not finite: the projections' values are too large",
 				 recon->norms.not_finite);
+	if (code == 0 && restraint_has_edges(recon->restraint))
+		code = see_halves(recon, err);
 	if (code == 0)
 		code = correct(recon, CORRECT_AFTER_FDK, err);
 	recon->work_done += corrections_work(recipe, &recon->input.linearise);
@@ -503,7 +543,7 @@ static int begin_restraint(struct recon *recon, struct error *err)
 	/* Without metal and its rays there is nothing to hold iterations back for in a grid that holds the body. */
 	if (recon->recipe.metal.on && !recon->outside)
 		return 0;
-	if (!dense && !recon->outside && !(restraint_has_edges(recon->restraint) && recon_spares_fdk(recon)))
+	if (!dense && !recon->outside && !restraint_has_edges(recon->restraint))
 		return 0;
 	return restraint_begin(recon->restraint, recon->backend, recon->volume, err);
 }

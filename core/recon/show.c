@@ -77,7 +77,8 @@ static int show_restrained(struct recon *recon, struct volume_norms *norms, stru
 	if (recon->alternation == NULL && !recon->smoothed)
 		code = recon->backend->volume_copy(recon->before, recon->volume, err);
 	if (code == 0)
-		code = restraint_show(recon->restraint, recon->backend, recon->volume, recon_spares_fdk(recon),
+		code = restraint_show(recon->restraint, recon->backend, recon->volume,
+				      recon->outside || recon_spares_fdk(recon),
 				      recon->left_out_dense ? &recon->corrections : NULL, &report, err);
 	recon->smoothed = recon->smoothed || report.changed;
 	if (code == 0 && report.changed)

@@ -564,6 +564,47 @@ START_TEST(the_mean_is_narrower_where_tv_has_explicit_numbers)
 }
 END_TEST
 
+/*
+ * A wrist, two tubes of bone with walls of less than half a voxel, on voxels of 3.2 pixels, whose edges iterations
+ * cannot hold. No place in it is even, and with noise TV takes of FDK's volume: that FDK's edges are to be had as well
+ * is known from every other view alone. Without them 58.1 and 58.6 HU, FDK 47.7. Found from outside.
+ */
+static const struct {
+	double middle[3], photons;
+	int views;
+} wrists[] = {{{2.9, 1.1, -2}, 0, 80}, {{2.9, 1.1, -2}, 3e5, 80}};
+START_TEST(bone_thinner_than_voxels_has_fdk_s_edges_as_well)
+{
+	const double pixel = 3.6 * 620 / 1100, voxel = 3.2 * pixel, water = .0192, *at = wrists[_i].middle;
+	struct ellipsoid parts[] = {
+	    {SHAPE_ELLIPSOID, {34, 23, 50}, {at[0], at[1], at[2]}, 0, water},
+	    {SHAPE_CYLINDER, {8, 8, 34}, {at[0] - 14, at[1] + 1, at[2] + 2}, 0, water},
+	    {SHAPE_CYLINDER, {5.5, 5.5, 34}, {at[0] - 14, at[1] + 1, at[2] + 2}, 0, -.9 * water},
+	    {SHAPE_CYLINDER, {8, 8, 34}, {at[0] + 14, at[1] + 1, at[2] + 2}, 0, water},
+	    {SHAPE_CYLINDER, {5.5, 5.5, 34}, {at[0] + 14, at[1] + 1, at[2] + 2}, 0, -.9 * water},
+	};
+	const struct phantom wrist = {5, parts};
+	const int views = wrists[_i].views;
+	const struct orbit_spec spec = {96, 64, views, {620, 1100, {3.6, 3.6}, {0, 0}, {0, 0}}, 0, 360. / views};
+	const struct grid grid = grid_of(13, 10, 18, voxel, voxel, voxel);
+	float *truth = malloc(sizeof(*truth) * grid_voxels(&grid));
+	struct outcome outcome = {.threads = 1};
+	struct scene scene;
+	struct beside found;
+
+	ck_assert_ptr_nonnull(truth);
+	phantom_voxelise(&wrist, &grid, 3, truth);
+	scene_orbit(&scene, &spec);
+	scene_add(&scene, &wrist);
+	add_noise(&scene, wrists[_i].photons);
+	found = reconstruct(&scene, &grid, truth, true, &outcome);
+	ck_assert_msg(found.last < found.fdk, "FDK %.1f HU, SART %.1f", found.fdk, found.last);
+	outcome_clear(&outcome);
+	scene_clear(&scene);
+	free(truth);
+}
+END_TEST
+
 Suite *averaging_suite(void)
 {
 	Suite *suite = suite_create("averaging");
@@ -583,6 +624,8 @@ Suite *averaging_suite(void)
 	tcase_add_loop_test(edges, flat_bodies_on_the_automatic_grid_are_no_worse_than_fdk, 0, 5);
 	tcase_add_test(edges, fdk_s_blur_is_known_beside_a_voxel_s);
 	tcase_add_loop_test(edges, edges_that_fdk_shows_as_well_are_the_mean_of_both, 0, 2);
+	tcase_add_loop_test(edges, bone_thinner_than_voxels_has_fdk_s_edges_as_well, 0,
+			    sizeof(wrists) / sizeof(wrists[0]));
 	tcase_add_test(decision, the_default_averages_what_is_not_made_of_voxels);
 	tcase_add_test(decision, the_default_s_mean_has_the_variance_that_it_is_asked_for);
 	tcase_add_test(decision, the_mean_is_narrower_where_tv_has_explicit_numbers);
