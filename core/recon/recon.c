@@ -240,7 +240,7 @@ int recon_open(const struct backend *backend, struct device *device, const struc
 		code = open_restraint(recon, err);
 	if (code == 0 && recon->recipe.algorithm != NULL)
 		code = alternation_new(&recon->recipe.grid, recon->geometry, recon->recipe.mu_water,
-				       recon->recipe.iterate.nonnegative, &recon->alternation, err);
+				       &recon->alternation, err);
 	if (code < 0) {
 		recon_free(recon);
 		return code;

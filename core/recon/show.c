@@ -8,8 +8,7 @@ static int measure(struct recon *recon, struct volume_norms *ret_norms, struct e
 	return recon->backend->norms(recon->plan, recon->volume, NULL, recon->recipe.tv.options.unit, ret_norms, err);
 }
 
-/* An iterate without what alternates from slice to slice, hardly seen; `before`, which no iteration reads, has the
- * iterate.
+/* An iterate without what alternates from slice to slice unseen; `before`, which no iteration reads, has the iterate.
  */
 static int show_smoothed(struct recon *recon, struct volume_norms *norms, struct error *err)
 {
@@ -20,9 +19,9 @@ static int show_smoothed(struct recon *recon, struct volume_norms *norms, struct
 		return 0;
 	code = recon->backend->volume_copy(recon->before, recon->volume, err);
 	if (code == 0)
-		code = alternation_show(recon->alternation, recon->backend, recon->before, recon->volume, &report, err);
-	recon->smoothed = report.changed;
-	if (code == 0 && report.changed)
+		code = alternation_show(recon->alternation, recon->backend, recon->volume, &report, err);
+	recon->smoothed = report.much;
+	if (code == 0 && report.much)
 		code = measure(recon, norms, err);
 	if (code == 0 && recon->ended)
 		warn_alternation(&recon->warnings, &recon->recipe, &report);

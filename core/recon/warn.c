@@ -197,14 +197,13 @@ void warn_alternation(const struct warning_sink *sink, const struct recipe *reci
 {
 	const double hu = recipe->mu_water / 1000;
 
-	if (report->slices > 0)
+	if (report->much)
 		warning_tell(
 		    sink, "slices_smoothed",
-		    "the object ends amid a slice, between two rows: iterations made %d slices too high and too "
-		    "low in turn, which views hardly see. Kept volumes have that evened along z, by up to %.0f HU "
-		    "in the mean of a slice; slices at such an end are uncertain. Slices where rows meet the axis, "
-		    "as the automatic grid's, have less",
-		    report->slices, report->change / hu);
+		    "the detector's rows lie on the borders between slices, where no view sees what alternates "
+		    "from slice to slice: it grew to %.0f HU in the mean of a slice, and %d slices of kept volumes "
+		    "are smoothed along z. A slice more or less, or half a voxel along z, puts slices on rows",
+		    report->amplitude / hu, report->slices);
 }
 
 void warn_thin(const struct warning_sink *sink, double width)

@@ -32,7 +32,7 @@ void warn_tv(const struct warning_sink *sink, const struct recipe *recipe, const
 void warn_ends(const struct warning_sink *sink, const struct recipe *recipe, const struct ends_report *report);
 /* "iterations_settled": relaxation falls before the last iteration; from: the iteration after which it does. */
 void warn_settled(const struct warning_sink *sink, const struct recipe *recipe, double from);
-/* "slices_smoothed": what alternated from slice to slice, hardly seen by views, was more than a little. */
+/* "slices_smoothed": what alternated from slice to slice, seen by no view, was more than a little. */
 void warn_alternation(const struct warning_sink *sink, const struct recipe *recipe,
 		      const struct alternation_report *report);
 /* "iterations_held_back" and "noise_beside_metal": what the restraint has changed. */
