@@ -54,7 +54,7 @@ struct warning_views {
 };
 /* Adds a projection to the list, the next one in rising order. */
 void warning_views_add(struct warning_views *views, int projection);
-enum { WARNING_DETAIL_SIZE = 320, WARNING_TEXT_SIZE = 512 };
+enum { WARNING_DETAIL_SIZE = 448, WARNING_TEXT_SIZE = 640 };
 void warning_parse(const char *text, char ret_detail[WARNING_DETAIL_SIZE], struct warning_views *ret_views);
 /* "7 to 10, 12 and 3 more"; "" where there are none. */
 void warning_views_describe(const struct warning_views *views, char *ret, size_t size);

@@ -89,7 +89,7 @@ struct message {
 	struct volume_support support;
 	size_t bytes;
 	size_t written_s, written_ns;  /* the time of change of a volume's file (saver_written) */
-	char code_name[64], text[512]; /* WARNING: code and detail; ENDED: text */
+	char code_name[64], text[640]; /* WARNING: code and detail; ENDED: text */
 	int code, card;
 };
 

@@ -7,6 +7,7 @@
 
 #include "core/recon/quality.h"
 #include "core/scan/image.h"
+#include "core/warning.h"
 #include "daemon/id.h"
 #include "daemon/store/quarantine.h"
 #include "daemon/watch.h"
@@ -460,7 +461,7 @@ struct volume_record {
 };
 
 struct warning_record {
-	char code[64], detail[512];
+	char code[64], detail[WARNING_TEXT_SIZE];
 };
 
 /*

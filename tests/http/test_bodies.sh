@@ -41,7 +41,7 @@ test_a_skull_wider_than_the_detector() {
 	# How far it reaches, and no less than it does.
 	req GET "/v1/jobs/$job"
 	expect_json '[.warnings[] | select(.code == "truncated") | .severity] == ["caution"]'
-	told=$(jq -c '.warnings[] | select(.code == "truncated") | .detail | capture("All of the field of view is uncertain by that: by up to (?<inner>[0-9]+) HU within (?<within>[0-9]+) mm of its axis, and from there outwards by more, up to (?<rim>[0-9]+) HU at its rim, at (?<radius>[0-9]+) mm") | map_values(tonumber)' "$body")
+	told=$(jq -c '.warnings[] | select(.code == "truncated") | .detail | capture("All of the field of view is uncertain by that: by up to (?<inner>[0-9]+) HU within (?<within>[0-9]+) mm of its axis, and from there outwards by more, up to (?<rim>[0-9]+) HU at its rim, at (?<radius>[0-9]+) mm, or [0-9]+ HU where bone is cut there$") | map_values(tonumber)' "$body")
 	expect_number "$(jq .within <<<"$told")" '==' 39 "mm of the axis that are told"
 	expect_number "$(jq '.radius - 64.5 | fabs' <<<"$told")" '<' 1 "mm of the rim that is told, from the field of view's"
 	for name in fdk final; do
