@@ -8,6 +8,7 @@
 #include "core/recon/alternation.h"
 #include "core/recon/ends.h"
 #include "core/recon/held_out.h"
+#include "core/recon/means.h"
 #include "core/recon/refining.h"
 #include "core/recon/restraint.h"
 #include "core/recon/rim.h"
@@ -48,6 +49,8 @@ struct recon {
 	struct alternation *alternation; /* from slice to slice, not in volumes that are kept; NULL: views see it */
 	struct rim *rim;                 /* of the field of view, in volumes that are kept; NULL: it is the iterate's */
 	struct restraint *restraint;     /* of volumes that are kept, beside their start; NULL: there is none */
+	struct means *means;             /* of FDK over voxels, in volumes that are kept; NULL: they have none */
+	double within;                   /* how far projections show more than the grid's voxels hold, 0 .. 1 */
 	bool left_out_dense;             /* rays through what is very dense have no part in the iterations */
 	bool outside;                    /* matter outside of the grid was taken out of the projections */
 	struct support *support;         /* NULL until a volume is kept */
@@ -81,7 +84,7 @@ struct recon {
  * Cost of the stages relative to an FDK of the whole scan, roughly, as measured on CPU and GPU alike: used for the
  * progress bar only.
  */
-static const double WORK_LOAD = 0.2, WORK_FDK = 1, WORK_TV = 0.2;
+static const double WORK_LOAD = 0.2, WORK_FDK = 1, WORK_TV = 0.2, WORK_MEANS = MEANS_PLACES;
 /*
  * What a refinement takes on a device with memory of its own, as many times as on the processor beside an FDK there:
  * its volumes are small, and the processor has a part in each step. .7 s on an H200, 73e9 updates a second.
@@ -142,8 +145,11 @@ static inline bool recipe_has_restraint(const struct recipe *recipe, const struc
 	return recipe_has_rim(recipe, orbit) && has_subsets(recipe) && recipe->tv.on && recipe->tv.automatic;
 }
 
-/* True if TV finds too little noise in the FDK volume to take anything of it. */
-bool recon_spares_fdk(const struct recon *recon);
+/* Of a job that takes metal out FDK's own means have the metal still. */
+static inline bool recipe_has_means(const struct recipe *recipe, const struct orbit *orbit)
+{
+	return recipe_has_restraint(recipe, orbit) && !recipe->metal.on;
+}
 
 /* The options point into recon, which is described, has its input, and its weights where FDK is on. */
 struct plan_options plan_options(const struct recon *recon);

@@ -181,12 +181,8 @@ static size_t kept_bytes(const struct recon *recon)
 		bytes += ends_bytes(&recipe->grid, recon->geometry, &recon->orbit);
 	if (recipe_has_rim(recipe, &recon->orbit))
 		bytes += rim_bytes(&recipe->grid, &recon->orbit);
-	if (recipe_has_restraint(recipe, &recon->orbit)) {
-		const struct edge_blur edges =
-		    edges_blur(&recipe->grid, &recon->orbit, recipe->fdk.window, recipe->fdk.cutoff);
-
-		bytes += restraint_bytes(&recipe->grid, &edges);
-	}
+	if (recipe_has_restraint(recipe, &recon->orbit))
+		bytes += restraint_bytes(&recipe->grid);
 	if (recipe->algorithm != NULL)
 		bytes += alternation_bytes(&recipe->grid);
 	if (thin_width(recipe, &recon->orbit) > 0)
@@ -207,6 +203,8 @@ static int memory_on(const struct backend *backend, struct device *device, struc
 					   .averages = recipe_averages(recipe, &recon->orbit),
 					   .subsets = has_subsets(recipe)};
 	const struct refine_device on = {backend, device};
+	const struct means_options means_of = {backend, device, recon->geometry, &recon->orbit, recipe};
+	struct means_bytes means = {0};
 	struct refine_bytes refining = {0};
 	size_t kept = kept_bytes(recon);
 	struct walk beside = {.backend = backend, .device = device, .measures = true}, planned = beside;
@@ -218,12 +216,22 @@ static int memory_on(const struct backend *backend, struct device *device, struc
 
 	if (code == 0)
 		code = refining_bytes(recipe, recon->geometry, &recon->orbit, &on, &refining, err);
+	if (code == 0 && recipe_has_means(recipe, &recon->orbit))
+		code = means_bytes(&means_of, &means, err);
 	if (code == 0)
 		code = walk_beside(recon, &beside, err);
 	if (code == 0)
 		code = walk_planned(recon, &planned, err);
-	kept += refining.aside;
+	kept += refining.aside + means.kept;
 	around.device += refining.device;
+	/* Out of core the device is free again after each operation. */
+	if (backend != &backend_outofcore)
+		around.device += means.device;
+	else if (means.device > around.device)
+		around.device = means.device;
+	around.host += means.host;
+	if (means.borrowed > around.borrowed)
+		around.borrowed = means.borrowed;
 	options->beside = around.device + beside.projections + beside.volumes + beside.scratch;
 	options->lends = around.borrowed;
 	if (code == 0)

@@ -122,6 +122,7 @@ static int open_corrections(struct recon *recon, struct error *err)
 	    .outside = &recon->outside,
 	    .left_out_dense = &recon->left_out_dense,
 	    .settled = &recon->settled,
+	    .within = &recon->within,
 	    .warnings = &recon->warnings,
 	    .cancel = &recon->cancel,
 	};
@@ -174,15 +175,22 @@ static int open_rim(struct recon *recon, struct error *err)
 static int open_restraint(struct recon *recon, struct error *err)
 {
 	const struct recipe *recipe = &recon->recipe;
-	const struct edge_blur edges = edges_blur(&recipe->grid, &recon->orbit, recipe->fdk.window, recipe->fdk.cutoff);
-	int code;
 
 	if (!recipe_has_restraint(recipe, &recon->orbit))
 		return 0;
-	code = restraint_new(&recipe->grid, recipe->mu_water, recon->orbit.pixel_at_isocentre[0], &edges,
+	return restraint_new(&recipe->grid, recipe->mu_water, recon->orbit.pixel_at_isocentre[0],
 			     recipe->iterate.nonnegative, &recon->restraint, err);
-	if (restraint_has_edges(recon->restraint))
-		recon->work_total += WORK_FDK / 2;
+}
+
+static int open_means(struct recon *recon, struct error *err)
+{
+	const struct means_options options = {recon->backend, recon->device, recon->geometry, &recon->orbit,
+					      &recon->recipe};
+	int code = 0;
+
+	if (recipe_has_means(&recon->recipe, &recon->orbit))
+		code = means_new(&options, &recon->means, err);
+	recon->work_total += recon->means != NULL ? WORK_MEANS : 0;
 	return code;
 }
 
@@ -214,6 +222,7 @@ int recon_open(const struct backend *backend, struct device *device, const struc
 	recon->given = geometry;
 	recon->hooks = hooks;
 	recon->settled = INFINITY;
+	recon->within = 1;
 	recon->cancel = (struct cancel){.asked = hooks->cancelled, .context = hooks->context};
 	recon->warnings = (struct warning_sink){.context = hooks->context, .tell = hooks->warning};
 	code = recon_describe(recon, recipe, err);
@@ -238,6 +247,8 @@ int recon_open(const struct backend *backend, struct device *device, const struc
 		code = open_rim(recon, err);
 	if (code == 0)
 		code = open_restraint(recon, err);
+	if (code == 0)
+		code = open_means(recon, err);
 	if (code == 0 && recon->recipe.algorithm != NULL)
 		code = alternation_new(&recon->recipe.grid, recon->geometry, recon->recipe.mu_water,
 				       &recon->alternation, err);
@@ -259,6 +270,7 @@ void recon_clear(struct recon *recon)
 	ends_free(recon->ends);
 	rim_free(recon->rim);
 	restraint_free(recon->restraint);
+	means_free(recon->means);
 	alternation_free(recon->alternation);
 	corrections_close(&recon->corrections);
 	recon_release(recon);
@@ -463,11 +475,14 @@ static size_t stopping_bytes(const struct recon *recon)
 
 size_t recon_state_bytes(const struct recon *recon)
 {
-	return algorithm_bytes(recon) + ends_state_bytes(recon->ends) + rim_state_bytes(recon->rim) +
-	       restraint_state_bytes(recon->restraint) + stopping_bytes(recon);
+	return algorithm_bytes(recon) + ends_state_bytes(recon->ends) + means_state_bytes(recon->means) +
+	       rim_state_bytes(recon->rim) + restraint_state_bytes(recon->restraint) + stopping_bytes(recon);
 }
 
-/* Writes the algorithm's state, and behind it the end slices, the rim and the volume that the iterations began with. */
+/*
+ * Writes the algorithm's state, and behind it the end slices, FDK's means, the rim and the volume that the iterations
+ * began with.
+ */
 int recon_save_state(struct recon *recon, const struct checkpoint_sink *sink, struct error *err)
 {
 	int code = 0;
@@ -478,6 +493,8 @@ int recon_save_state(struct recon *recon, const struct checkpoint_sink *sink, st
 		code = sink->write(sink->context, ends_state(recon->ends), ends_state_bytes(recon->ends), err);
 	if (code == 0 && stopping_bytes(recon) > 0)
 		code = sink->write(sink->context, &recon->stopping, sizeof(recon->stopping), err);
+	if (code == 0 && recon->means != NULL)
+		code = sink->write(sink->context, means_state(recon->means), means_state_bytes(recon->means), err);
 	if (code == 0 && rim_state_bytes(recon->rim) > 0)
 		code = sink->write(sink->context, rim_state(recon->rim), rim_state_bytes(recon->rim), err);
 	if (code == 0 && restraint_state_bytes(recon->restraint) > 0)
@@ -532,6 +549,8 @@ int recon_resume_state(struct recon *recon, const char *bytes, size_t size, stru
 		ends_resume(recon->ends, bytes + own);
 	if (code == 0 && stopping_bytes(recon) > 0)
 		memcpy(&recon->stopping, bytes + own + ends_state_bytes(recon->ends), sizeof(recon->stopping));
+	if (code == 0 && recon->means != NULL)
+		means_resume(recon->means, bytes + whole - means_state_bytes(recon->means));
 	if (code == 0 && rim > 0) /* rim and restraint stand behind the rest */
 		code = rim_resume(recon->rim, bytes + whole, err);
 	if (code == 0 && size > whole + rim)

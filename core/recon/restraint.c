@@ -37,15 +37,13 @@ struct node {
 struct restraint {
 	struct grid grid;
 	double mu_water, blur, most; /* 1/mm; of FDK, mm; of S, times water */
-	struct edge_blur edges;
 	bool nonnegative;
 	int cells[3];
 	size_t slice, voxels;
-	float *start;         /* [z][y][x], S, owned; in between what TV took; NULL before either is known */
-	signed char *limit;   /* [z][y][x], behind start: what an iterate gets back at most, with its sign */
-	unsigned char *noise; /* [z][y][x], behind limit, where there are edges: FDK's (edges_see) */
-	bool lost, begun;     /* TV took something; S is there */
-	bool holds_dense;     /* what is very dense stays as S has it */
+	float *start;       /* [z][y][x], S, owned; in between what TV took; NULL before either is known */
+	signed char *limit; /* [z][y][x], behind start: what an iterate gets back at most, with its sign */
+	bool lost, begun;   /* TV took something; S is there */
+	bool holds_dense;   /* what is very dense stays as S has it */
 };
 
 static size_t cells_of(const struct grid *grid)
@@ -59,35 +57,34 @@ static size_t nodes_of(const struct grid *grid)
 	       (size_t)(grid->size[2] / CELL + 1);
 }
 
-static size_t kept_bytes(const struct grid *grid, const struct edge_blur *edges)
+static size_t kept_bytes(const struct grid *grid)
 {
-	return grid_voxels(grid) * (sizeof(float) + sizeof(signed char) + (edges->share > 0 ? 1 : 0));
+	return grid_voxels(grid) * (sizeof(float) + sizeof(signed char));
 }
 
 size_t restraint_kept_bytes(const struct restraint *restraint)
 {
-	return kept_bytes(&restraint->grid, &restraint->edges);
+	return kept_bytes(&restraint->grid);
 }
 
-size_t restraint_bytes(const struct grid *grid, const struct edge_blur *edges)
+size_t restraint_bytes(const struct grid *grid)
 {
 	const size_t slice = (size_t)grid->size[0] * (size_t)grid->size[1];
-	const int across = CELL * (edges->share > 0 ? 2 : ACROSS_LEAST);
+	const int across = CELL * ACROSS_LEAST;
 
 	if (grid->size[0] < across || grid->size[1] < across || grid->size[2] < CELL)
 		return 0;
-	return kept_bytes(grid, edges) + cells_of(grid) * (sizeof(struct cell) + sizeof(float)) +
-	       nodes_of(grid) * sizeof(struct node) + 2 * slice * sizeof(float) + places_bytes(grid) +
-	       edges_bytes(grid);
+	return kept_bytes(grid) + cells_of(grid) * (sizeof(struct cell) + sizeof(float)) +
+	       nodes_of(grid) * sizeof(struct node) + 2 * slice * sizeof(float) + places_bytes(grid);
 }
 
-int restraint_new(const struct grid *grid, double mu_water, double blur, const struct edge_blur *edges,
-		  bool nonnegative, struct restraint **ret_restraint, struct error *err)
+int restraint_new(const struct grid *grid, double mu_water, double blur, bool nonnegative,
+		  struct restraint **ret_restraint, struct error *err)
 {
 	struct restraint *restraint;
 
 	*ret_restraint = NULL;
-	if (restraint_bytes(grid, edges) == 0)
+	if (restraint_bytes(grid) == 0)
 		return 0;
 	restraint = malloc(sizeof(*restraint));
 	if (restraint == NULL)
@@ -96,7 +93,6 @@ int restraint_new(const struct grid *grid, double mu_water, double blur, const s
 	    .grid = *grid,
 	    .mu_water = mu_water,
 	    .blur = blur,
-	    .edges = *edges,
 	    .nonnegative = nonnegative,
 	    .cells = {grid->size[0] / CELL, grid->size[1] / CELL, grid->size[2] / CELL},
 	    .slice = (size_t)grid->size[0] * (size_t)grid->size[1],
@@ -104,11 +100,6 @@ int restraint_new(const struct grid *grid, double mu_water, double blur, const s
 	};
 	*ret_restraint = restraint;
 	return 0;
-}
-
-bool restraint_has_edges(const struct restraint *restraint)
-{
-	return restraint != NULL && restraint->edges.share > 0;
 }
 
 void restraint_free(struct restraint *restraint)
@@ -119,7 +110,7 @@ void restraint_free(struct restraint *restraint)
 	free(restraint);
 }
 
-/* All of it 0, and so much noise that edges stay. */
+/* All of it 0. */
 static int make_room(struct restraint *restraint, struct error *err)
 {
 	if (restraint->start != NULL)
@@ -128,22 +119,7 @@ static int make_room(struct restraint *restraint, struct error *err)
 	if (restraint->start == NULL)
 		return error_set(err, ERR_NO_MEMORY, "no memory for a start of %zu voxels", restraint->voxels);
 	restraint->limit = (signed char *)(restraint->start + restraint->voxels);
-	restraint->noise = (unsigned char *)restraint->limit + restraint->voxels;
-	if (restraint_has_edges(restraint))
-		memset(restraint->noise, UCHAR_MAX, restraint->voxels);
 	return 0;
-}
-
-int restraint_see_halves(struct restraint *restraint, const struct edge_halves *halves, struct error *err)
-{
-	int code = make_room(restraint, err);
-
-	if (code == 0)
-		code = edges_see(&restraint->edges, &restraint->grid, restraint->mu_water, halves, restraint->start,
-				 restraint->noise, err);
-	if (code == 0)
-		memset(restraint->start, 0, restraint->voxels * sizeof(*restraint->start));
-	return code;
 }
 
 /* ---- sums over cubes ---- */
@@ -677,24 +653,18 @@ static int follow(struct restraint *restraint, struct showing *showing, struct r
 	return code;
 }
 
-int restraint_show(struct restraint *restraint, const struct backend *backend, struct volume *volume, bool held,
+int restraint_show(struct restraint *restraint, const struct backend *backend, struct volume *volume,
 		   const struct correction_chain *dense, struct restraint_report *ret_report, struct error *err)
 {
 	struct showing showing = {.backend = backend, .volume = volume, .dense = dense};
-	int code = 0;
+	int code;
 
 	*ret_report = (struct restraint_report){.share = 1};
 	if (!restraint->begun)
 		return 0;
 	restraint->holds_dense = dense != NULL;
-	held = held || restraint->most >= RESTRAINT_DENSE || !restraint_has_edges(restraint);
-	if (held && restraint->cells[0] >= ACROSS_LEAST && restraint->cells[1] >= ACROSS_LEAST)
-		code = follow(restraint, &showing, ret_report, err);
+	code = follow(restraint, &showing, ret_report, err);
 	if (showing.counts[0] > 0)
 		ret_report->restored = (double)showing.counts[1] / (double)showing.counts[0];
-	if (code < 0 || !restraint_has_edges(restraint) || restraint->most >= RESTRAINT_METAL || restraint->holds_dense)
-		return code;
-	ret_report->changed = true;
-	return edges_show(&restraint->edges, &restraint->grid, restraint->mu_water, restraint->nonnegative,
-			  restraint->start, restraint->noise, backend, volume, err);
+	return code;
 }

@@ -3,7 +3,7 @@
 
 #include "core/backend.h"
 #include "core/correct/correction.h"
-#include "core/recon/restraint_edges.h"
+#include "core/scan/grid.h"
 
 /*
  * How far the default's iterations are followed, where they may come out worse than FDK: beside what is very dense, and
@@ -42,9 +42,6 @@
  *
  * Of a job that takes metal out S has none, and it is held back only where the object goes on outside of the grid.
  *
- * Edges. Where FDK blurs no more than a voxel does, V' has edges that are the mean of both
- * (core/recon/restraint_edges.h), unless there is something as dense as metal.
- *
  * Only volumes that are kept have V'; the iterate goes on as it is. tests/bench/results/dense.txt has the figures and
  * what else was tried. One thread at a time; the same bits for any number of threads.
  */
@@ -64,22 +61,15 @@ struct restraint_report {
 #define RESTRAINT_DENSE 2.5
 
 /* Bytes of the host's memory, once it has begun; 0: restraint_new makes nothing, the grid has too few voxels. */
-size_t restraint_bytes(const struct grid *grid, const struct edge_blur *edges);
-/* blur: the width of FDK's, mm; edges: the same beside a voxel's. */
-int restraint_new(const struct grid *grid, double mu_water, double blur, const struct edge_blur *edges,
-		  bool nonnegative, struct restraint **ret_restraint, struct error *err);
-/* Whether FDK's edges may be better, so that it is to begin in any case; false for NULL. */
-bool restraint_has_edges(const struct restraint *restraint);
+size_t restraint_bytes(const struct grid *grid);
+/* blur: the width of FDK's, mm. */
+int restraint_new(const struct grid *grid, double mu_water, double blur, bool nonnegative,
+		  struct restraint **ret_restraint, struct error *err);
 void restraint_free(struct restraint *restraint); /* NULL is fine */
 
 /* Notes what TV took of FDK's means. Before restraint_begin. */
 int restraint_see_loss(struct restraint *restraint, const struct backend *backend, struct volume *fdk,
 		       struct volume *smoothed, struct error *err);
-/*
- * Takes FDK's noise from its volume, as it came out of FDK, and that of every other view. Before restraint_see_loss.
- * Where it is not called, edges stay.
- */
-int restraint_see_halves(struct restraint *restraint, const struct edge_halves *halves, struct error *err);
 /* Takes S from the volume that the iterations begin with. */
 int restraint_begin(struct restraint *restraint, const struct backend *backend, struct volume *volume,
 		    struct error *err);
@@ -91,11 +81,9 @@ const void *restraint_state(const struct restraint *restraint);
 int restraint_resume(struct restraint *restraint, const char *bytes, struct error *err);
 
 /*
- * V becomes V', where it has begun: held back, if `held` or S is dense or there are no edges, and with its edges.
- * held: the object goes on outside of the grid, or TV took nothing of FDK's volume. dense: what has the traces of the
- * rays that were left out; or NULL.
+ * V becomes V', where it has begun. dense: what has the traces of the rays that were left out; or NULL.
  */
-int restraint_show(struct restraint *restraint, const struct backend *backend, struct volume *volume, bool held,
+int restraint_show(struct restraint *restraint, const struct backend *backend, struct volume *volume,
 		   const struct correction_chain *dense, struct restraint_report *ret_report, struct error *err);
 
 #endif

@@ -37,11 +37,6 @@ static double tv_alpha(const struct recon *recon, enum noise_stage stage)
 	return noise_alpha(&recon->noise, recipe, &recon->orbit, stage);
 }
 
-bool recon_spares_fdk(const struct recon *recon)
-{
-	return tv_alpha(recon, NOISE_OF_FDK) == INFINITY;
-}
-
 static void tell_noise(const struct recon *recon)
 {
 	const struct recipe *recipe = &recon->recipe;
@@ -352,33 +347,33 @@ static bool in_fdk(const struct recon *recon, int view)
 	return true;
 }
 
-/* FDK of every other view, in `before`, says how noisy the FDK volume is (restraint_edges.h). */
-static int see_halves(struct recon *recon, struct error *err)
+/* FDK's means over voxels, of the views that it has. Beside what is as dense as metal they are none. */
+static int make_means(struct recon *recon, struct error *err)
 {
-	const struct backend *backend = recon->backend;
-	size_t cut[2] = {0}, cut_then[2] = {0};
-	int all = 0, taken = 0, code = backend->filter_extended(recon->plan, cut, err);
+	const int all = recon->geometry->count;
+	struct means_source source = {
+	    .plan = recon->plan,
+	    .fdk = &recon->fdk,
+	    .projections = recon->projections,
+	    .work = recon->before,
+	    .factor = 1 / (1 - input_blank_share(&recon->input, &recon->orbit)),
+	    .cancel = &recon->cancel,
+	};
+	int *views, code;
 
-	recon->work_done += WORK_FDK / 2;
-	if (code == 0)
-		code = backend->volume_fill(recon->before, 0, err);
-	for (int view = 0; view < recon->geometry->count && code == 0; view++) {
-		if (!in_fdk(recon, view) || all++ % 2 == 0)
-			continue;
-		taken++;
-		code = fdk_add(&recon->fdk, view, view, recon->projections, recon->before, err);
-	}
-	if (code == 0)
-		code = fdk_flush(&recon->fdk, recon->projections, recon->before, err);
-	if (code == 0)
-		code = backend->filter_extended(recon->plan, cut_then, err);
-	for (int side = 0; side < 2 && code == 0; side++)
-		recon->input.cut_again[side] += cut_then[side] - cut[side];
-	if (code < 0 || taken == 0)
-		return code;
-	return restraint_see_halves(
-	    recon->restraint, &(struct edge_halves){backend, recon->volume, recon->before, (double)taken / (double)all},
-	    err);
+	recon->work_done += recon->means != NULL ? WORK_MEANS : 0;
+	if (recon->means == NULL || recon->norms.maximum >= RESTRAINT_METAL * recon->recipe.mu_water)
+		return 0;
+	views = malloc((size_t)all * sizeof(*views));
+	if (views == NULL)
+		return error_set(err, ERR_NO_MEMORY, "no memory for a list of %d views", all);
+	for (int view = 0; view < all; view++)
+		if (in_fdk(recon, view))
+			views[source.count++] = view;
+	source.views = views;
+	code = means_make(recon->means, &source, err);
+	free(views);
+	return code;
 }
 
 /* The FDK volume and what is made of it before the first iteration. */
@@ -393,8 +388,8 @@ static int finish_fdk(struct recon *recon, struct error *err)
 		code = error_set(err, ERR_IMPOSSIBLE,
 				 "%zu voxels of the FDK volume are not finite: the projections' values are too large",
 				 recon->norms.not_finite);
-	if (code == 0 && restraint_has_edges(recon->restraint))
-		code = see_halves(recon, err);
+	if (code == 0)
+		code = make_means(recon, err);
 	if (code == 0)
 		code = correct(recon, CORRECT_AFTER_FDK, err);
 	recon->work_done += corrections_work(recipe, &recon->input.linearise);
@@ -543,7 +538,7 @@ static int begin_restraint(struct recon *recon, struct error *err)
 	/* Without metal and its rays there is nothing to hold iterations back for in a grid that holds the body. */
 	if (recon->recipe.metal.on && !recon->outside)
 		return 0;
-	if (!dense && !recon->outside && !restraint_has_edges(recon->restraint))
+	if (!dense && !recon->outside)
 		return 0;
 	return restraint_begin(recon->restraint, recon->backend, recon->volume, err);
 }

@@ -77,7 +77,6 @@ static int show_restrained(struct recon *recon, struct volume_norms *norms, stru
 		code = recon->backend->volume_copy(recon->before, recon->volume, err);
 	if (code == 0)
 		code = restraint_show(recon->restraint, recon->backend, recon->volume,
-				      recon->outside || recon_spares_fdk(recon),
 				      recon->left_out_dense ? &recon->corrections : NULL, &report, err);
 	recon->smoothed = recon->smoothed || report.changed;
 	if (code == 0 && report.changed)
@@ -85,6 +84,21 @@ static int show_restrained(struct recon *recon, struct volume_norms *norms, stru
 	if (code == 0 && recon->ended)
 		warn_restraint(&recon->warnings, &recon->recipe, &report);
 	return code;
+}
+
+/* An iterate with FDK's means over voxels; `before`, which no iteration reads, has the iterate. */
+static int show_means(struct recon *recon, struct volume_norms *norms, struct error *err)
+{
+	int code = 0;
+
+	if (!means_there(recon->means) || recon->left_out_dense || recon->within == 0 || recon->iteration == 0)
+		return 0;
+	if (recon->alternation == NULL && !recon->smoothed)
+		code = recon->backend->volume_copy(recon->before, recon->volume, err);
+	if (code == 0)
+		code = means_show(recon->means, recon->within, recon->volume, err);
+	recon->smoothed = true;
+	return code == 0 ? measure(recon, norms, err) : code;
 }
 
 /* The end slices of an iterate as they are kept; the last one's are told of where they are uncertain. */
@@ -110,6 +124,8 @@ int recon_show(struct recon *recon, struct volume_norms *norms, struct error *er
 		code = show_thick(recon, norms, err);
 	if (code == 0)
 		code = show_restrained(recon, norms, err);
+	if (code == 0)
+		code = show_means(recon, norms, err);
 	if (code == 0)
 		code = show_rim(recon, norms, err);
 	return code == 0 ? show_ends(recon, norms, err) : code;

@@ -9,7 +9,7 @@
 
 #include "core/correct/averaging.h"
 #include "core/recon/algorithm.h"
-#include "core/recon/restraint_edges.h"
+#include "core/recon/means.h"
 #include "tests/unit/anatomy.h"
 #include "tests/unit/scene.h"
 
@@ -406,39 +406,35 @@ START_TEST(flat_bodies_on_the_automatic_grid_are_no_worse_than_fdk)
 }
 END_TEST
 
-/* Three pixels of Hann's window blur as much as a voxel along a row, and less along the axis. */
-START_TEST(fdk_s_blur_is_known_beside_a_voxel_s)
+/* Places within a voxel, and pixels without a window, have a voxel's variance at 3.5 pixels a voxel. */
+START_TEST(the_blur_of_fdk_s_means_is_known_beside_a_voxel_s)
 {
 	static const struct {
-		double pixels, cutoff;
-		enum window window;
-		float excess[2], share;
-	} cases[] = {
-	    {3, 1, WINDOW_HANN, {0, -1. / 36}, 1},        {2.5, 1, WINDOW_HANN, {.01833f, -.02167f}, 1},
-	    {2, 1, WINDOW_HANN, {.05208f, -.01042f}, 0},  {2, 1, WINDOW_RAM_LAK, {-.01042f, -.01042f}, 1},
-	    {3, .5, WINDOW_HANN, {.08333f, -1. / 36}, 0},
-	};
+		double pixels;
+		float excess, share;
+	} cases[] = {{3.46410f, 0, 1}, {2.5, .0095833f, 1}, {1.75, .0304f, .5408f}, {1.5, .0451f, 0}};
+
 	for (size_t k = 0; k < sizeof(cases) / sizeof(cases[0]); k++) {
-		const struct orbit orbit = {.pixel_at_isocentre = {1, 1}};
+		const struct orbit orbit = {.pixel_at_isocentre = {1, 1}},
+				   leans = {.pixel_at_isocentre = {1, 1}, .lean = .1};
 		const double mm = cases[k].pixels;
 		const struct grid grid = grid_of(8, 8, 8, mm, mm, mm);
-		const struct edge_blur blur = edges_blur(&grid, &orbit, cases[k].window, cases[k].cutoff);
+		const struct means_blur blur = means_blur(&grid, &orbit);
 
-		ck_assert_float_eq_tol(blur.excess[0], cases[k].excess[0], 1e-4f);
-		ck_assert_float_eq_tol(blur.excess[1], cases[k].excess[0], 1e-4f);
-		ck_assert_float_eq_tol(blur.excess[2], cases[k].excess[1], 1e-4f);
-		ck_assert_float_eq_tol(blur.share, cases[k].share, 1e-4f);
+		for (int axis = 0; axis < 3; axis++)
+			ck_assert_float_eq_tol(blur.excess[axis], cases[k].excess, 1e-4f);
+		ck_assert_float_eq_tol(blur.share, cases[k].share, 1e-3f);
+		ck_assert_float_eq(means_blur(&grid, &leans).share, 0);
 	}
 }
 END_TEST
 
 /*
- * A body with a rod of bone on voxels of three pixels, no noise, which goes on beyond the grid: ten iterations had 16.3
- * HU in the middle slices where FDK has 15.8, for its edges are as good as a voxel allows. Of one that ends there,
- * iterations are the better in any case; one that goes on was 14.9 when the other one was 13.9, for the model of what
- * lies outside had the edges in the grid that the mean over pixels did not reach.
+ * A body with a rod of bone on voxels of three pixels, no noise, which goes on beyond the grid, and one that ends
+ * there: ten iterations alone have 13.2 and 12.9 HU in the middle slices, FDK 15.8, FDK's means over voxels make them
+ * 10.6 and 10.9.
  */
-START_TEST(edges_that_fdk_shows_as_well_are_the_mean_of_both)
+START_TEST(edges_that_iterations_cannot_hold_are_fdk_s_means)
 {
 	enum { ACROSS = 32, HIGH = 20, FROM = 5 };
 	const double voxel = 2, pixel = voxel / 3, water = .0192, high = _i == 0 ? 80 : 17;
@@ -471,7 +467,7 @@ START_TEST(edges_that_fdk_shows_as_well_are_the_mean_of_both)
 	run(&scene, &recipe, &outcome);
 	fdk = body_error(outcome_volume(&outcome, "fdk") + first, truth + first, count);
 	last = body_error(outcome_volume(&outcome, "final") + first, truth + first, count);
-	ck_assert_msg(last < .9 * fdk, "FDK %.1f HU, SART %.1f", fdk, last);
+	ck_assert_msg(last < .75 * fdk, "FDK %.1f HU, SART %.1f", fdk, last);
 	if (_i == 0)
 		expect_same_after_a_yield(&scene, &recipe, 2, &outcome);
 	outcome_clear(&outcome);
@@ -566,14 +562,14 @@ END_TEST
 
 /*
  * A wrist, two tubes of bone with walls of less than half a voxel, on voxels of 3.2 pixels, whose edges iterations
- * cannot hold. No place in it is even, and with noise TV takes of FDK's volume: that FDK's edges are to be had as well
- * is known from every other view alone. Without them 58.1 and 58.6 HU, FDK 47.7. Found from outside.
+ * cannot hold, with noise and without: 42.5 HU, FDK 40.4; with FDK's means over voxels 21.0. Walls so thin need many
+ * points a voxel to be known.
  */
 static const struct {
 	double middle[3], photons;
 	int views;
 } wrists[] = {{{2.9, 1.1, -2}, 0, 80}, {{2.9, 1.1, -2}, 3e5, 80}};
-START_TEST(bone_thinner_than_voxels_has_fdk_s_edges_as_well)
+START_TEST(bone_thinner_than_voxels_has_fdk_s_means)
 {
 	const double pixel = 3.6 * 620 / 1100, voxel = 3.2 * pixel, water = .0192, *at = wrists[_i].middle;
 	struct ellipsoid parts[] = {
@@ -593,12 +589,12 @@ START_TEST(bone_thinner_than_voxels_has_fdk_s_edges_as_well)
 	struct beside found;
 
 	ck_assert_ptr_nonnull(truth);
-	phantom_voxelise(&wrist, &grid, 3, truth);
+	phantom_voxelise(&wrist, &grid, 12, truth);
 	scene_orbit(&scene, &spec);
 	scene_add(&scene, &wrist);
 	add_noise(&scene, wrists[_i].photons);
 	found = reconstruct(&scene, &grid, truth, true, &outcome);
-	ck_assert_msg(found.last < found.fdk, "FDK %.1f HU, SART %.1f", found.fdk, found.last);
+	ck_assert_msg(found.last < .6 * found.fdk, "FDK %.1f HU, SART %.1f", found.fdk, found.last);
 	outcome_clear(&outcome);
 	scene_clear(&scene);
 	free(truth);
@@ -622,10 +618,9 @@ Suite *averaging_suite(void)
 	tcase_add_loop_test(edges, a_skull_in_noise_is_not_taken_for_one_of_voxels_nor_its_bone_for_noise, 0,
 			    sizeof(heads) / sizeof(heads[0]));
 	tcase_add_loop_test(edges, flat_bodies_on_the_automatic_grid_are_no_worse_than_fdk, 0, 5);
-	tcase_add_test(edges, fdk_s_blur_is_known_beside_a_voxel_s);
-	tcase_add_loop_test(edges, edges_that_fdk_shows_as_well_are_the_mean_of_both, 0, 2);
-	tcase_add_loop_test(edges, bone_thinner_than_voxels_has_fdk_s_edges_as_well, 0,
-			    sizeof(wrists) / sizeof(wrists[0]));
+	tcase_add_test(edges, the_blur_of_fdk_s_means_is_known_beside_a_voxel_s);
+	tcase_add_loop_test(edges, edges_that_iterations_cannot_hold_are_fdk_s_means, 0, 2);
+	tcase_add_loop_test(edges, bone_thinner_than_voxels_has_fdk_s_means, 0, sizeof(wrists) / sizeof(wrists[0]));
 	tcase_add_test(decision, the_default_averages_what_is_not_made_of_voxels);
 	tcase_add_test(decision, the_default_s_mean_has_the_variance_that_it_is_asked_for);
 	tcase_add_test(decision, the_mean_is_narrower_where_tv_has_explicit_numbers);
