@@ -69,8 +69,9 @@ static int reduce_geometry(struct reduced *reduced, const struct coarse_options 
 {
 	const struct geometry *from = options->geometry;
 	const double *spacing = options->grid->spacing, *pixel = options->orbit->pixel_at_isocentre;
-	const double voxel = fmin(fmin(spacing[0], spacing[1]), spacing[2]);
-	const int columns = bins(from->columns, pixel[0], voxel), rows = bins(from->rows, pixel[1], voxel);
+	const double across = fmin(spacing[0], spacing[1]);
+	const int columns = bins(from->columns, pixel[0], across);
+	const int rows = bins(from->rows, pixel[1], fmin(across, spacing[2]));
 	const double pixels_of_a_bin[2] = {(double)from->columns / columns, (double)from->rows / rows};
 	struct view *views = NULL;
 	int count = 0, code = 0;

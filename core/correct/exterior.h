@@ -21,7 +21,8 @@
  *    along the length of a body that is truncated in others has all of its shadow, and with it what lies beyond.
  *    Smooth is at each column the value of the straight line fitted to the columns
  *    up to 1/EXTERIOR_PART of the row away from it. So SART keeps FDK's means over
- *    many columns there and adds what is finer.
+ *    many columns there and adds what is finer. Where a body ends those would be w's means
+ *    if its slices were higher than FDK's blur (EXTERIOR_SLICES_OF_A_ROW).
  *
  * Where both are there, step 2 goes first, with the start of w: its fit to the projections would otherwise put
  * what lies beyond the field of view into it.

@@ -156,6 +156,7 @@ static int look(const struct correction_job *job, struct exterior_volume_options
 	}
 	/* From zero, iterations take too long to fill what is held beside the field of view where the grid has that. */
 	options->truncated = seen.truncated > 0 && sound && fdk;
+	options->fine_slices = seen.truncated > 0 && sound;
 	/*
 	 * An object may end inside of the grid: FDK's blur beyond its faces is none of the object. One that truncates
 	 * rows up to both ends goes on beside a grid that ends with the field of view, though no ray that is seen

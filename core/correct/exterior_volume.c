@@ -9,17 +9,6 @@
 #include "core/correct/exterior_views.h"
 #include "core/truncation.h"
 
-static int voxels_a_side(const struct exterior_volume_options *options)
-{
-	const struct geometry *geometry = options->geometry;
-	const double pixels = (double)geometry->columns * geometry->rows * geometry->count;
-	const double voxels = fmax((double)grid_voxels(options->grid), pixels / 4);
-	/* The fit takes several volumes. */
-	const double most = cbrt(options->inside_only ? voxels : voxels / 2);
-
-	return (int)fmin(fmax(most, EXTERIOR_VOLUME_LEAST), EXTERIOR_VOLUME_MOST);
-}
-
 /* The centre of a voxel, mm. */
 struct place {
 	double at[3];
@@ -29,122 +18,6 @@ static struct place place_of(const struct grid *grid, int x, int y, int z)
 {
 	return (struct place){{grid->origin[0] + x * grid->spacing[0], grid->origin[1] + y * grid->spacing[1],
 			       grid->origin[2] + z * grid->spacing[2]}};
-}
-
-struct box {
-	double low[3], high[3];
-};
-
-static struct box box_of(const struct grid *grid)
-{
-	struct box box;
-
-	for (int i = 0; i < 3; i++) {
-		box.low[i] = grid->origin[i] - 0.5 * grid->spacing[i];
-		box.high[i] = grid->origin[i] + (grid->size[i] - 0.5) * grid->spacing[i];
-	}
-	return box;
-}
-
-static void box_add(struct box *box, const struct box *other)
-{
-	for (int i = 0; i < 3; i++) {
-		box->low[i] = fmin(box->low[i], other->low[i]);
-		box->high[i] = fmax(box->high[i], other->high[i]);
-	}
-}
-
-/* The two places where a ray meets a cylinder around the orbit's axis. */
-static void box_add_ray(struct box *box, const struct orbit *orbit, double radius, const double from[3],
-			const double way[3])
-{
-	double a = 0, b = 0, c = -radius * radius, start[3];
-
-	orbit_from_centre(orbit, from, start);
-	for (int i = 0; i < 2; i++) {
-		const double along = vec_dot(orbit->frame[i], way);
-
-		a += along * along;
-		b += start[i] * along;
-		c += start[i] * start[i];
-	}
-	for (int side = -1; side <= 1 && a > 0 && b * b > a * c; side += 2) {
-		const double part = (-b + side * sqrt(b * b - a * c)) / a;
-		struct box place;
-
-		for (int i = 0; i < 3; i++)
-			place.low[i] = place.high[i] = from[i] + part * way[i];
-		box_add(box, &place);
-	}
-}
-
-/* Around what the rays to the first and the last row meet of that cylinder. */
-static void box_add_rays(struct box *box, const struct orbit *orbit, double radius, const struct geometry *geometry)
-{
-	enum { ALONG = 9 };
-
-	for (int k = 0; k < geometry->count; k++)
-		for (int i = 0; i < 2 * ALONG; i++) {
-			const struct view *view = &geometry->views[k];
-			const double column = (geometry->columns - 1.) * (i / 2) / (ALONG - 1);
-			const double row = i % 2 ? geometry->rows - 0.5 : -0.5;
-			double way[3];
-
-			for (int a = 0; a < 3; a++)
-				way[a] = view->pixel0[a] + column * view->column_step[a] + row * view->row_step[a] -
-					 view->source[a];
-			box_add_ray(box, orbit, radius, view->source, way);
-		}
-}
-
-/* No side has more voxels than `most`. */
-static void grid_of_box(const struct box *box, double spacing, int most, struct grid *ret)
-{
-	for (int i = 0; i < 3; i++)
-		spacing = fmax(spacing, (box->high[i] - box->low[i]) / most);
-	for (int i = 0; i < 3; i++) {
-		const double side = box->high[i] - box->low[i];
-
-		/* A part of a millionth is rounding, not another voxel. */
-		ret->size[i] = (int)fmax(1, ceil(side / spacing - 1e-6));
-		ret->spacing[i] = side / ret->size[i];
-		ret->origin[i] = box->low[i] + 0.5 * ret->spacing[i];
-	}
-}
-
-static void box_widen(struct box *box, double by)
-{
-	for (int i = 0; i < 2; i++) {
-		box->low[i] -= by;
-		box->high[i] += by;
-	}
-}
-
-/*
- * Around the recipe's grid, the field of view, with its margin where rows are truncated, and its rays; without the
- * margin, the rays, or around the recipe's grid alone, where the sources leave no room for more.
- */
-static void choose_grid(const struct exterior_volume_options *options, struct grid *ret)
-{
-	const int most = voxels_a_side(options);
-	struct grid wide;
-	struct error err;
-
-	orbit_covering_grid(options->orbit, options->geometry, most, &wide);
-	for (int reach = options->inside_only ? 0 : options->truncated ? 3 : 2; reach >= 0; reach--) {
-		const double radius = options->orbit->field_of_view / 2,
-			     margin = reach > 2 ? EXTERIOR_MARGIN * radius : 0;
-		struct box view = box_of(&wide), box = box_of(options->grid);
-
-		box_widen(&view, margin);
-		if (reach > 0)
-			box_add(&box, &view);
-		if (reach > 1)
-			box_add_rays(&box, options->orbit, radius + margin, options->geometry);
-		grid_of_box(&box, wide.spacing[0], most, ret);
-		if (grid_check_geometry(ret, options->geometry, &err) == 0)
-			return;
-	}
 }
 
 static struct plan_options plan_options_of(const struct exterior_volume_options *options, const struct grid *grid,
@@ -209,7 +82,7 @@ static int bytes_of(const struct exterior_volume_options *options, struct exteri
 	size_t own;
 	int code;
 
-	choose_grid(options, &grid);
+	exterior_volume_grid(options, &grid);
 	plan = plan_options_of(options, &grid, &weights);
 	coarse_options = coarse_options_of(options, &grid);
 	code = backend->plan_bytes(options->device, &plan, &bytes, err);
@@ -234,7 +107,7 @@ static int bytes_of(const struct exterior_volume_options *options, struct exteri
 int exterior_volume_bytes(const struct exterior_volume_options *options, struct exterior_volume_bytes *ret_bytes,
 			  struct error *err)
 {
-	enum { INSIDE_ONLY = 1, TRUNCATED = 2, KINDS };
+	enum { OTHERS, INSIDE_ONLY, TRUNCATED, KINDS };
 	struct exterior_volume_bytes most = {0};
 	int code = 0;
 
@@ -244,6 +117,7 @@ int exterior_volume_bytes(const struct exterior_volume_options *options, struct 
 
 		one.inside_only = kind == INSIDE_ONLY;
 		one.truncated = kind == TRUNCATED;
+		one.fine_slices = kind != OTHERS;
 		code = bytes_of(&one, &bytes, err);
 		if (code < 0)
 			break;
@@ -524,7 +398,7 @@ int exterior_volume_may_go_on(const struct exterior_volume_options *options, boo
 	size_t possible = 0;
 	int code;
 
-	choose_grid(options, &grid);
+	exterior_volume_grid(options, &grid);
 	look.met = calloc(grid_voxels(&grid), sizeof(bool));
 	look.empty = malloc(grid_voxels(&grid) * sizeof(bool));
 	if (look.met == NULL || look.empty == NULL) {
@@ -569,7 +443,7 @@ int exterior_volume_make(struct exterior_volume *s, const struct exterior_volume
 	int code;
 
 	*s = (struct exterior_volume){.backend = backend};
-	choose_grid(options, &s->grid);
+	exterior_volume_grid(options, &s->grid);
 	/* The filter is as sharp as the voxels can hold: an exterior smeared over the grid's faces would be missed
 	 * inside. */
 	code = fdk_weights_make(&s->weights, orbit, options->geometry, WINDOW_RAM_LAK,

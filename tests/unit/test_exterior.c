@@ -865,6 +865,64 @@ START_TEST(the_end_slices_of_few_rows_are_true_in_a_body_wider_than_the_detector
 }
 END_TEST
 
+/* Mean errors of a slice within the radius, HU. */
+static double mean_of_slice(const struct grid *grid, double radius, const float *volume, const float *truth, int z)
+{
+	size_t at = (size_t)z * (size_t)grid->size[0] * (size_t)grid->size[1];
+	double sum = 0;
+	int count = 0;
+
+	for (int y = 0; y < grid->size[1]; y++)
+		for (int x = 0; x < grid->size[0]; x++, at++)
+			if (hypot(grid->origin[0] + x * grid->spacing[0], grid->origin[1] + y * grid->spacing[1]) <
+			    radius) {
+				sum += 1000 * ((double)volume[at] - (double)truth[at]) / MU_WATER;
+				count++;
+			}
+	return sum / count;
+}
+
+/*
+ * The same body where it ends within the rows, flat: FDK blurs the end over a row, by up to 300 HU in the slice on
+ * either side, and the iterations' slices are off by what FDK's are and 40 HU at most. The last one of the body was 310
+ * HU farther off, or 66 and the one before it 14.
+ */
+START_TEST(a_body_wider_than_the_detector_that_ends_within_the_rows_ends_as_in_fdk)
+{
+	static const double ends[] = {5.4, 8.1};            /* mm, between slices */
+	static const double radius = 0.6 * 64.5, some = 40; /* mm of the field of view; HU */
+	struct ellipsoid body = {SHAPE_CYLINDER, {90, 75, 500}, {0, 0, ends[_i] - 500}, 0, MU_WATER};
+	const struct phantom phantom = {1, &body};
+	const struct orbit_spec spec = {96, 26, 60, {620, 1100, {2.4, 2.4}, {0, 0}, {0, 0}}, 0, 6};
+	const struct grid grid = grid_of(88, 88, 18, 1.35, 1.35, 1.35);
+	struct recipe recipe = sart_on(&grid);
+	float *truth = malloc(sizeof(float) * grid_voxels(&grid));
+	int emit[] = {EMIT_FDK};
+	struct outcome outcome = {0};
+	struct scene scene;
+
+	ck_assert_ptr_nonnull(truth);
+	recipe.iterate.iterations = 3;
+	recipe.emit = emit;
+	recipe.emits = 1;
+	scene_orbit(&scene, &spec);
+	scene_add(&scene, &phantom);
+	phantom_voxelise(&phantom, &grid, 3, truth);
+	run(&scene, &recipe, &outcome);
+	for (int z = 0; z < grid.size[2]; z++) {
+		const double fdk = mean_of_slice(&grid, radius, outcome_volume(&outcome, "fdk"), truth, z);
+		const double last = mean_of_slice(&grid, radius, outcome.last, truth, z);
+
+		ck_assert_msg(fabs(last) < fabs(fdk) + some, "slice %d of %d: %.1f HU, FDK %.1f", z, grid.size[2], last,
+			      fdk);
+	}
+	ck_assert_ptr_null(strstr(outcome.warnings, "end_slices: "));
+	outcome_clear(&outcome);
+	scene_clear(&scene);
+	free(truth);
+}
+END_TEST
+
 /*
  * From zero, on a grid that goes on beyond the field of view, a part of a body that goes on there, too, is put there:
  * 100 to 300 HU. It is told then, and not where the grid ends with the field, the run begins with FDK, or the body ends
@@ -1312,6 +1370,7 @@ Suite *exterior_suite(void)
 	tcase_add_loop_test(truncated, the_rim_of_the_field_of_view_is_as_true_as_that_of_fdk, 0, 2);
 	tcase_add_loop_test(truncated, the_end_slices_of_few_rows_are_true_in_a_body_wider_than_the_detector, 0, 2);
 	tcase_add_test(truncated, the_rim_of_slices_that_not_all_views_see_is_true);
+	tcase_add_loop_test(truncated, a_body_wider_than_the_detector_that_ends_within_the_rows_ends_as_in_fdk, 0, 2);
 	tcase_add_loop_test(truncated, a_body_that_is_spread_beyond_the_field_of_view_is_told, 0, 6);
 	tcase_add_loop_test(truncated, what_lies_outside_is_sought_about_an_axis_beside_the_origin, 0, 2);
 	tcase_add_test(truncated, a_scan_moved_along_z_has_the_same_image);
