@@ -71,17 +71,12 @@ double averaging_sharpness(double pixels)
 	return fmin(1, fmax(0, (pixels - TOLD_FROM) / (WIDE_FROM - TOLD_FROM)));
 }
 
-double averaging_within(double ratio)
+double averaging_variance(double pixels, double ratio, double noise, double edges, double shells)
 {
 	/* Objects of voxels have ratios up to .137, what is blurred by tilted rows has .141 and more. */
 	static const double voxels = 0.137, body = 0.141;
-
-	return ratio > 0 ? fmin(1, fmax(0, (ratio - voxels) / (body - voxels))) : 1;
-}
-
-double averaging_variance(double pixels, double ratio, double noise, double edges, double shells)
-{
 	static const double seen = 0.05, narrow = 0.09, wide = 0.15, narrow_to = 1.8, wide_from = WIDE_FROM;
+	const double told = ratio > 0 ? fmin(1, fmax(0, (ratio - voxels) / (body - voxels))) : 1;
 	const double fine = fmin(1, fmax(0, (wide_from - pixels) / (wide_from - TOLD_FROM)));
 	const double thin = narrow + (seen - narrow) * edges * fine;
 	const double upto = narrow_to + (TOLD_FROM - narrow_to) * edges;
@@ -89,8 +84,7 @@ double averaging_variance(double pixels, double ratio, double noise, double edge
 	const double narrowed = ratio > 0 ? 1 : 1 - averaging_sharpness(pixels);
 	const double more = fmax(shells, fmin(1, fmax(0, (pixels - upto) / (wide_from - upto))));
 
-	return averaging_part(pixels) * averaging_within(ratio) *
-	       (thin + (wide - thin) * more * fmax(0, 1 - narrowed * noise / NOISY));
+	return averaging_part(pixels) * told * (thin + (wide - thin) * more * fmax(0, 1 - narrowed * noise / NOISY));
 }
 
 double averaging_model_share(double pixels, double noise)
@@ -591,7 +585,6 @@ static int widths_of_default(const struct correction_job *job, const struct stat
 	}
 	/* Of white noise a second difference has six times the variance. */
 	noise = squares.noise > 0 ? 6 * squares.noise / (6 * squares.noise + shown) : 0;
-	*job->within = averaging_within(ratio);
 	for (int i = 0; i < 2; i++)
 		ret_widths[i] = averaging_width(averaging_variance(state->pixels[i], ratio, noise, edges, shells) *
 						pow(state->pixels[i], 2) / ALWAYS_PASSES);
@@ -633,7 +626,6 @@ static int decide(const struct correction_job *job, const struct state *state, s
 	share = averaging_share(ratio);
 	settling = settling_share(state->pixels[0], sums + AVERAGING_DISTANCES);
 	edges = fmax(share, settling);
-	*job->within = averaging_within(ratio);
 	if (state->always)
 		code = widths_of_default(job, state, sums, ratio, settling, widths, &model, err);
 	else

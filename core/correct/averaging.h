@@ -69,11 +69,6 @@ struct averaging_mean averaging_mean(const struct recipe *recipe);
  * is thinner than voxels can hold it is as wide as with finer pixels. 0: no mean.
  */
 double averaging_variance(double pixels, double ratio, double noise, double edges, double shells);
-/*
- * How far the projections are not those of an object that is made of the grid's voxels, 0 .. 1, from the same ratio; 1
- * where noise hides it.
- */
-double averaging_within(double ratio);
 /* How far pixels are so fine that FDK has edges as sharp as voxels can hold, 0 .. 1: nothing up to 2 pixels a voxel. */
 double averaging_sharpness(double pixels);
 /*

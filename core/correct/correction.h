@@ -61,8 +61,7 @@ struct correction_job {
 	bool *outside;                     /* set where matter outside of the grid was taken out of the projections */
 	bool *left_out_dense;              /* set where rays through what is very dense were left out of them */
 	double *settled;                   /* iterations after which relaxation falls (averaging.h); INFINITY: never */
-	double *within;      /* how far projections show what no voxels of the grid hold, 0 .. 1 (averaging_within) */
-	struct metal *dense; /* what is very dense, and its traces (dense.h); the chain's own */
+	struct metal *dense;               /* what is very dense, and its traces (dense.h); the chain's own */
 	/*
 	 * The model by which matter outside of the grid was taken out of the projections, on the host alone, until they
 	 * are averaged; where it does not go on nothing was taken. The chain's own.

@@ -50,7 +50,6 @@ struct recon {
 	struct rim *rim;                 /* of the field of view, in volumes that are kept; NULL: it is the iterate's */
 	struct restraint *restraint;     /* of volumes that are kept, beside their start; NULL: there is none */
 	struct means *means;             /* of FDK over voxels, in volumes that are kept; NULL: they have none */
-	double within;                   /* how far projections show more than the grid's voxels hold, 0 .. 1 */
 	bool left_out_dense;             /* rays through what is very dense have no part in the iterations */
 	bool outside;                    /* matter outside of the grid was taken out of the projections */
 	struct support *support;         /* NULL until a volume is kept */
@@ -84,7 +83,7 @@ struct recon {
  * Cost of the stages relative to an FDK of the whole scan, roughly, as measured on CPU and GPU alike: used for the
  * progress bar only.
  */
-static const double WORK_LOAD = 0.2, WORK_FDK = 1, WORK_TV = 0.2, WORK_MEANS = MEANS_PLACES;
+static const double WORK_LOAD = 0.2, WORK_FDK = 1, WORK_TV = 0.2, WORK_MEANS = MEANS_PLACES + 1;
 /*
  * What a refinement takes on a device with memory of its own, as many times as on the processor beside an FDK there:
  * its volumes are small, and the processor has a part in each step. .7 s on an H200, 73e9 updates a second.

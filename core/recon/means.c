@@ -14,8 +14,13 @@ static const double WHOLE = 1.5, NONE = 2;
 static const float MOST = 0.8f;
 /* Of <E^2>: halves have streaks of half as many views, most of which all together have not. */
 static const float COUNTED = 0.25f;
+/* q of objects that are made of voxels, and of bodies. */
+static const double VOXELS = 0.24, BODY = 0.29;
+/* What halves have in common is known where it is so many times what chance alone makes of it. */
+static const double CERTAIN = 10;
 /* <D^2> and <E^2> are over so many voxels to either side. */
 enum { BESIDE = 1 };
+enum { MIDDLE = MEANS_PLACES };
 /* s, the root of <E^2>, is kept in a byte: so many steps double it, and the first one is so many HU. */
 static const float STEPS = 16, FIRST = 0.25f;
 
@@ -24,7 +29,8 @@ struct means {
 	struct means_blur blur;
 	size_t pixels, voxels; /* of a slice, and of all */
 	float *values;         /* [z][y][x], R, owned; all 0 before it is made */
-	unsigned char *noise;  /* [z][y][x], behind values: s */
+	float *within;         /* behind values: how far the object is not made of voxels, 0 .. 1 */
+	unsigned char *noise;  /* [z][y][x], behind that: s */
 	bool there;
 };
 
@@ -49,7 +55,7 @@ struct means_blur means_blur(const struct grid *grid, const struct orbit *orbit)
 
 static size_t state_bytes(const struct grid *grid)
 {
-	return grid_voxels(grid) * (sizeof(float) + 1);
+	return (grid_voxels(grid) + 1) * sizeof(float) + grid_voxels(grid);
 }
 
 static struct plan_options plan_options_of(const struct means_options *of, const struct grid *grid,
@@ -94,7 +100,8 @@ int means_bytes(const struct means_options *options, struct means_bytes *ret_byt
 	code = options->backend->plan_bytes(options->device, &plan, &bytes, err);
 	if (code < 0)
 		return code;
-	ret_bytes->kept = state_bytes(grid) + 3 * (size_t)grid->size[0] * (size_t)grid->size[1] * sizeof(float);
+	ret_bytes->kept = state_bytes(grid) + 3 * (size_t)grid->size[0] * (size_t)grid->size[1] * sizeof(float) +
+			  2 * grid_voxels(grid) * sizeof(float);
 	ret_bytes->borrowed = bytes.block;
 	ret_bytes->device = bytes.volumes + bytes.scratch - bytes.block + bytes.raw;
 	/* The volume and the projections are the job's, and out of core they lie with the plan on the host. */
@@ -128,7 +135,8 @@ int means_new(const struct means_options *options, struct means **ret_means, str
 		free(means);
 		return error_set(err, ERR_NO_MEMORY, "no memory for means over %zu voxels", grid_voxels(grid));
 	}
-	means->noise = (unsigned char *)(means->values + means->voxels);
+	means->within = means->values + means->voxels;
+	means->noise = (unsigned char *)(means->within + 1);
 	*ret_means = means;
 	return 0;
 }
@@ -268,7 +276,10 @@ static unsigned char noise_of(const struct means *means, float spread)
 	return (unsigned char)fminf(UCHAR_MAX, fmaxf(0, roundf(STEPS * log2f(hu / FIRST))));
 }
 
-/* Adds FDK of every other view, from the first or the second on, at one place of each voxel. */
+/*
+ * Adds FDK of every other view, from the first or the second on, at one place of each voxel; behind the places is its
+ * middle.
+ */
 static int add_place(const struct means *means, const struct means_source *source, const struct fdk_weights *weights,
 		     int place, int first, struct error *err)
 {
@@ -278,7 +289,7 @@ static int add_place(const struct means *means, const struct means_source *sourc
 	struct fdk fdk = *source->fdk;
 	int code = cancel_check(source->cancel, err);
 
-	for (int axis = 0; axis < 3; axis++)
+	for (int axis = 0; axis < 3 && place != MIDDLE; axis++)
 		grid.origin[axis] += (place >> axis & 1 ? 0.25 : -0.25) * grid.spacing[axis];
 	options.lender = source->plan;
 	if (code == 0)
@@ -325,6 +336,85 @@ static int subtract(struct slices *slices, const struct means_source *source, do
 	return code;
 }
 
+/* ---- whether the object is made of voxels ---- */
+
+/* K F of a voxel within the grid. */
+static float linear(const int size[3], const float *middles, size_t at)
+{
+	static const float weights[3] = {0.125f, 0.75f, 0.125f};
+	const size_t row = (size_t)size[0], slice = row * (size_t)size[1];
+	float sum = 0;
+
+	for (size_t k = 0; k < 3; k++)
+		for (size_t j = 0; j < 3; j++) {
+			const float *line = middles + at + k * slice + j * row - slice - row;
+
+			sum += weights[k] * weights[j] * (weights[0] * (line[-1] + line[1]) + weights[1] * line[0]);
+		}
+	return sum;
+}
+
+/* Products of what both halves of the views show. */
+struct shown {
+	double departs, departs2; /* of R - K F, and their squares */
+	double bends, bends2;     /* of K F - F */
+};
+
+/* middles, means: of both halves, of the slice the means alone, times MEANS_PLACES. */
+static struct shown sum_slice(const int size[3], const float *const middles[2], const float *const means[2], int z)
+{
+	struct shown sum = {0};
+
+	for (int y = 1; y + 1 < size[1]; y++)
+		for (int x = 1; x + 1 < size[0]; x++) {
+			const size_t in_slice = (size_t)y * (size_t)size[0] + (size_t)x;
+			const size_t at = (size_t)z * (size_t)size[0] * (size_t)size[1] + in_slice;
+			double departs = 1, bends = 1;
+
+			for (int half = 0; half < 2; half++) {
+				const float smooth = linear(size, middles[half], at);
+
+				departs *= means[half][in_slice] / MEANS_PLACES - smooth;
+				bends *= smooth - middles[half][at];
+			}
+			sum.departs += departs;
+			sum.departs2 += departs * departs;
+			sum.bends += bends;
+			sum.bends2 += bends * bends;
+		}
+	return sum;
+}
+
+/* How far the object is not made of voxels. The means of the first half are in values, those of all in `work`. */
+static int look_within(struct means *means, const struct slices *slices, const struct means_source *source,
+		       const float *const middles[2], struct error *err)
+{
+	const int *size = means->of.recipe->grid.size;
+	struct shown sum = {0};
+	int code = 0;
+
+	for (int z = 1; z + 1 < size[2] && code == 0; z++) {
+		const float *half = means->values + (size_t)z * means->pixels;
+		const float *const of[2] = {half, slices->values};
+		struct shown slice;
+
+		code = means->of.backend->volume_download(source->work, z, 1, slices->values, err);
+		if (code < 0)
+			break;
+		for (size_t i = 0; i < means->pixels; i++)
+			slices->values[i] -= half[i];
+		slice = sum_slice(size, middles, of, z);
+		sum.departs += slice.departs;
+		sum.departs2 += slice.departs2;
+		sum.bends += slice.bends;
+		sum.bends2 += slice.bends2;
+	}
+	*means->within = 1;
+	if (sum.bends > CERTAIN * sqrt(sum.bends2))
+		*means->within = (float)fmin(1, fmax(0, (sum.departs / sum.bends - VOXELS) / (BODY - VOXELS)));
+	return code;
+}
+
 /* s of each voxel, of E, which lies in the place of R. */
 static void note_noise(struct means *means, const struct slices *slices)
 {
@@ -350,12 +440,25 @@ int means_make(struct means *means, const struct means_source *source, struct er
 	const float factor = (float)(source->factor / MEANS_PLACES);
 	struct fdk_weights weights = {0};
 	struct slices slices = {0};
+	float *middles = NULL;
 	int code = source->count < 2 ? 0 : open_slices(means, &slices, err);
 
 	if (code < 0 || source->count < 2)
 		return code;
-	code = fdk_weights_make(&weights, means->of.orbit, means->of.geometry, WINDOW_RAM_LAK, 1,
-				means->of.recipe->fdk.extend, err);
+	middles = malloc(2 * means->voxels * sizeof(*middles));
+	if (middles == NULL)
+		code = error_set(err, ERR_NO_MEMORY, "no memory for means over %zu voxels", means->voxels);
+	if (code == 0)
+		code = fdk_weights_make(&weights, means->of.orbit, means->of.geometry, WINDOW_RAM_LAK, 1,
+					means->of.recipe->fdk.extend, err);
+	for (int half = 0; half < 2 && code == 0; half++) {
+		code = backend->volume_fill(source->work, 0, err);
+		if (code == 0)
+			code = add_place(means, source, &weights, MIDDLE, 1 - half, err);
+		if (code == 0)
+			code = backend->volume_download(source->work, 0, grid->size[2],
+							middles + (size_t)half * means->voxels, err);
+	}
 	if (code == 0)
 		code = backend->volume_fill(source->work, 0, err);
 	if (code == 0)
@@ -364,6 +467,9 @@ int means_make(struct means *means, const struct means_source *source, struct er
 		code = backend->volume_download(source->work, 0, grid->size[2], means->values, err);
 	if (code == 0)
 		code = add_half(means, source, &weights, 0, err);
+	if (code == 0)
+		code =
+		    look_within(means, &slices, source, (const float *const[2]){middles, middles + means->voxels}, err);
 	if (code == 0)
 		code = subtract(&slices, source, (double)(source->count / 2) / source->count, means->values, err);
 	if (code == 0)
@@ -374,6 +480,7 @@ int means_make(struct means *means, const struct means_source *source, struct er
 		means->values[i] *= factor;
 	means->there = code == 0;
 	fdk_weights_clear(&weights);
+	free(middles);
 	free(slices.values);
 	return code;
 }
@@ -419,10 +526,10 @@ static void mend_slice(const struct slices *slices, int z, float share)
 		}
 }
 
-int means_show(const struct means *means, double within, struct volume *volume, struct error *err)
+int means_show(const struct means *means, struct volume *volume, struct error *err)
 {
 	const struct backend *backend = means->of.backend;
-	const float share = MOST * means->blur.share * (float)within;
+	const float share = MOST * means->blur.share * *means->within;
 	struct slices slices;
 	int code = open_slices(means, &slices, err);
 

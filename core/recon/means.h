@@ -29,9 +29,17 @@
  *
  * A quarter, for A and B have the streaks of half as many views, most of which their mean has not. In even places, u of
  * them (restraint_places.h, in air as well), V stays: w is times 1 - u. All of it where the variance of R is up to 1.5
- * of a voxel's, nothing from 2 on: from 2 and 1.55 pixels a voxel. An object that is made of the grid's voxels has no
- * other means than V has, and V stays (averaging_within). Beside what is as dense as metal streaks begin at edges, and
- * both halves have most of them: nothing is done there.
+ * of a voxel's, nothing from 2 on: from 2 and 1.55 pixels a voxel. Beside what is as dense as metal streaks begin at
+ * edges, and both halves have most of them: nothing is done there.
+ *
+ * An object that is made of the grid's voxels has no other means than V has, and V stays. It is linear from one voxel's
+ * middle to the next, so that R is K F: F is FDK at the middles without a window, and K the kernel 1/8, 3/4, 1/8 along
+ * each axis. Of
+ *
+ *   q = sum (R - K F)^2 / sum (K F - F)^2
+ *
+ * such objects have .05 to .24, bodies .29 to .64, what changes slowly .56: all is done from .29 on, nothing up to .24.
+ * Squares are products of what each half of the views shows, which noise has no part in.
  *
  * Only volumes that are kept have V'; the iterate goes on as it is. tests/bench/results/denoise.txt has the figures and
  * what else was tried. One thread at a time; the same bits for any number of threads.
@@ -89,7 +97,7 @@ void means_resume(struct means *means, const char *bytes);
 
 /* Whether there is anything to show; false for NULL. */
 bool means_there(const struct means *means);
-/* V, the volume, becomes V'. within: averaging_within. */
-int means_show(const struct means *means, double within, struct volume *volume, struct error *err);
+/* V, the volume, becomes V'. */
+int means_show(const struct means *means, struct volume *volume, struct error *err);
 
 #endif

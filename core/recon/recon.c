@@ -122,7 +122,6 @@ static int open_corrections(struct recon *recon, struct error *err)
 	    .outside = &recon->outside,
 	    .left_out_dense = &recon->left_out_dense,
 	    .settled = &recon->settled,
-	    .within = &recon->within,
 	    .warnings = &recon->warnings,
 	    .cancel = &recon->cancel,
 	};
@@ -222,7 +221,6 @@ int recon_open(const struct backend *backend, struct device *device, const struc
 	recon->given = geometry;
 	recon->hooks = hooks;
 	recon->settled = INFINITY;
-	recon->within = 1;
 	recon->cancel = (struct cancel){.asked = hooks->cancelled, .context = hooks->context};
 	recon->warnings = (struct warning_sink){.context = hooks->context, .tell = hooks->warning};
 	code = recon_describe(recon, recipe, err);

@@ -91,12 +91,12 @@ static int show_means(struct recon *recon, struct volume_norms *norms, struct er
 {
 	int code = 0;
 
-	if (!means_there(recon->means) || recon->left_out_dense || recon->within == 0 || recon->iteration == 0)
+	if (!means_there(recon->means) || recon->left_out_dense || recon->iteration == 0)
 		return 0;
 	if (recon->alternation == NULL && !recon->smoothed)
 		code = recon->backend->volume_copy(recon->before, recon->volume, err);
 	if (code == 0)
-		code = means_show(recon->means, recon->within, recon->volume, err);
+		code = means_show(recon->means, recon->volume, err);
 	recon->smoothed = true;
 	return code == 0 ? measure(recon, norms, err) : code;
 }

@@ -432,22 +432,34 @@ END_TEST
 /*
  * A body with a rod of bone on voxels of three pixels, no noise, which goes on beyond the grid, and one that ends
  * there: ten iterations alone have 13.2 and 12.9 HU in the middle slices, FDK 15.8, FDK's means over voxels make them
- * 10.6 and 10.9.
+ * 10.6 and 10.9. A skull whose projections have as little of half a voxel beside a voxel as objects of voxels have, so
+ * that iterations get all pixels: FDK 46.8, the means 38.8.
  */
 START_TEST(edges_that_iterations_cannot_hold_are_fdk_s_means)
 {
-	enum { ACROSS = 32, HIGH = 20, FROM = 5 };
-	const double voxel = 2, pixel = voxel / 3, water = .0192, high = _i == 0 ? 80 : 17;
-	struct ellipsoid parts[] = {
-	    {SHAPE_CYLINDER, {25, 21, high}, {.7, -.4, 0}, 0, water},
-	    {SHAPE_CYLINDER, {6, 6, high}, {-10, 2, 0}, 0, .7 * water},
-	    {SHAPE_ELLIPSOID, {4, 4, 4}, {8, 9, 1}, 0, .04 * water},
+	enum { FROM = 5 };
+	const double voxel = 2, water = .0192;
+	struct ellipsoid rods[2][3];
+	struct ellipsoid skull[] = {
+	    {SHAPE_ELLIPSOID, {34.8, 31.6, 20.4}, {0}, 0, 1.03 * water},
+	    {SHAPE_ELLIPSOID, {33.8, 30.6, 19.4}, {0}, 0, 1.21 * water},
+	    {SHAPE_ELLIPSOID, {30.04, 26.84, 15.64}, {0}, 0, -1.2 * water},
 	};
-	const struct phantom body = {3, parts};
+	const struct {
+		struct phantom body;
+		int across, high, columns, rows, binning;
+		double pixels, step, most;
+	} cases[] = {{{3, rods[0]}, 32, 20, 112, 74, 1, 3, 2.5, .75},
+		     {{3, rods[1]}, 32, 20, 112, 74, 1, 3, 2.5, .75},
+		     {{3, skull}, 42, 32, 304, 236, 2, 5.8, 4.5, .9}},
+	  *c = &cases[_i];
+	const double pixel = voxel / c->pixels;
+	const struct phantom body = c->body;
 	const struct orbit_spec spec = {
-	    112, 74, 80, {620, 1100, {pixel / 620 * 1100, pixel / 620 * 1100}, {0, 0}, {0, 0}}, 0, 2.5};
-	const struct grid grid = grid_of(ACROSS, ACROSS, HIGH, voxel, voxel, voxel);
-	const size_t first = FROM * ACROSS * ACROSS, count = (HIGH - 2 * FROM) * ACROSS * ACROSS;
+	    c->columns, c->rows, 80, {620, 1100, {pixel / 620 * 1100, pixel / 620 * 1100}, {0, 0}, {0, 0}}, 0, c->step};
+	const struct grid grid = grid_of(c->across, c->across, c->high, voxel, voxel, voxel);
+	const size_t slice = (size_t)c->across * (size_t)c->across, first = FROM * slice,
+		     count = (size_t)(c->high - 2 * FROM) * slice;
 	float *truth = malloc(sizeof(*truth) * grid_voxels(&grid));
 	struct recipe recipe = recipe_on(&grid);
 	struct outcome outcome = {.threads = 1};
@@ -456,9 +468,17 @@ START_TEST(edges_that_iterations_cannot_hold_are_fdk_s_means)
 	double fdk, last;
 
 	ck_assert_ptr_nonnull(truth);
+	for (int ends = 0; ends < 2; ends++) {
+		const double high = ends == 1 ? 17 : 80;
+
+		rods[ends][0] = (struct ellipsoid){SHAPE_CYLINDER, {25, 21, high}, {.7, -.4, 0}, 0, water};
+		rods[ends][1] = (struct ellipsoid){SHAPE_CYLINDER, {6, 6, high}, {-10, 2, 0}, 0, .7 * water};
+		rods[ends][2] = (struct ellipsoid){SHAPE_ELLIPSOID, {4, 4, 4}, {8, 9, 1}, 0, .04 * water};
+	}
 	phantom_voxelise(&body, &grid, 5, truth);
 	scene_orbit(&scene, &spec);
 	scene_add(&scene, &body);
+	recipe.binning = c->binning;
 	recipe.fdk.on = true;
 	recipe.emit = emit;
 	recipe.emits = 1;
@@ -467,7 +487,7 @@ START_TEST(edges_that_iterations_cannot_hold_are_fdk_s_means)
 	run(&scene, &recipe, &outcome);
 	fdk = body_error(outcome_volume(&outcome, "fdk") + first, truth + first, count);
 	last = body_error(outcome_volume(&outcome, "final") + first, truth + first, count);
-	ck_assert_msg(last < .75 * fdk, "FDK %.1f HU, SART %.1f", fdk, last);
+	ck_assert_msg(last < c->most * fdk, "FDK %.1f HU, SART %.1f", fdk, last);
 	if (_i == 0)
 		expect_same_after_a_yield(&scene, &recipe, 2, &outcome);
 	outcome_clear(&outcome);
@@ -619,7 +639,7 @@ Suite *averaging_suite(void)
 			    sizeof(heads) / sizeof(heads[0]));
 	tcase_add_loop_test(edges, flat_bodies_on_the_automatic_grid_are_no_worse_than_fdk, 0, 5);
 	tcase_add_test(edges, the_blur_of_fdk_s_means_is_known_beside_a_voxel_s);
-	tcase_add_loop_test(edges, edges_that_iterations_cannot_hold_are_fdk_s_means, 0, 2);
+	tcase_add_loop_test(edges, edges_that_iterations_cannot_hold_are_fdk_s_means, 0, 3);
 	tcase_add_loop_test(edges, bone_thinner_than_voxels_has_fdk_s_means, 0, sizeof(wrists) / sizeof(wrists[0]));
 	tcase_add_test(decision, the_default_averages_what_is_not_made_of_voxels);
 	tcase_add_test(decision, the_default_s_mean_has_the_variance_that_it_is_asked_for);
