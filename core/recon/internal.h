@@ -12,6 +12,7 @@
 #include "core/recon/refining.h"
 #include "core/recon/restraint.h"
 #include "core/recon/rim.h"
+#include "core/recon/stripes.h"
 #include "core/recon/stopping.h"
 #include "core/recon/support.h"
 #include "core/warning.h"
@@ -49,6 +50,7 @@ struct recon {
 	struct alternation *alternation; /* from slice to slice, not in volumes that are kept; NULL: views see it */
 	struct rim *rim;                 /* of the field of view, in volumes that are kept; NULL: it is the iterate's */
 	struct restraint *restraint;     /* of volumes that are kept, beside their start; NULL: there is none */
+	struct stripes *stripes;         /* that FDK has none of, not in volumes that are kept; NULL: there are none */
 	struct means *means;             /* of FDK over voxels, in volumes that are kept; NULL: they have none */
 	bool left_out_dense;             /* rays through what is very dense have no part in the iterations */
 	bool outside;                    /* matter outside of the grid was taken out of the projections */

@@ -182,7 +182,7 @@ static size_t kept_bytes(const struct recon *recon)
 	if (recipe_has_rim(recipe, &recon->orbit))
 		bytes += rim_bytes(&recipe->grid, &recon->orbit);
 	if (recipe_has_restraint(recipe, &recon->orbit))
-		bytes += restraint_bytes(&recipe->grid);
+		bytes += restraint_bytes(&recipe->grid) + stripes_bytes(&recipe->grid, &recon->orbit);
 	if (recipe->algorithm != NULL)
 		bytes += alternation_bytes(&recipe->grid);
 	if (thin_width(recipe, &recon->orbit) > 0)

@@ -174,11 +174,13 @@ static int open_rim(struct recon *recon, struct error *err)
 static int open_restraint(struct recon *recon, struct error *err)
 {
 	const struct recipe *recipe = &recon->recipe;
+	int code;
 
 	if (!recipe_has_restraint(recipe, &recon->orbit))
 		return 0;
-	return restraint_new(&recipe->grid, recipe->mu_water, recon->orbit.pixel_at_isocentre[0],
+	code = restraint_new(&recipe->grid, recipe->mu_water, recon->orbit.pixel_at_isocentre[0],
 			     recipe->iterate.nonnegative, &recon->restraint, err);
+	return code == 0 ? stripes_new(&recipe->grid, &recon->orbit, recipe->mu_water, &recon->stripes, err) : code;
 }
 
 static int open_means(struct recon *recon, struct error *err)
@@ -266,6 +268,7 @@ void recon_clear(struct recon *recon)
 	refining_free(recon->refining);
 	held_out_free(recon->held_out);
 	ends_free(recon->ends);
+	stripes_free(recon->stripes);
 	rim_free(recon->rim);
 	restraint_free(recon->restraint);
 	means_free(recon->means);
@@ -473,13 +476,14 @@ static size_t stopping_bytes(const struct recon *recon)
 
 size_t recon_state_bytes(const struct recon *recon)
 {
-	return algorithm_bytes(recon) + ends_state_bytes(recon->ends) + means_state_bytes(recon->means) +
-	       rim_state_bytes(recon->rim) + restraint_state_bytes(recon->restraint) + stopping_bytes(recon);
+	return algorithm_bytes(recon) + ends_state_bytes(recon->ends) + stripes_state_bytes(recon->stripes) +
+	       means_state_bytes(recon->means) + rim_state_bytes(recon->rim) + restraint_state_bytes(recon->restraint) +
+	       stopping_bytes(recon);
 }
 
 /*
- * Writes the algorithm's state, and behind it the end slices, FDK's means, the rim and the volume that the iterations
- * began with.
+ * Writes the algorithm's state, and behind it the end slices, what alternates in FDK, FDK's means, the rim and the
+ * volume that the iterations began with.
  */
 int recon_save_state(struct recon *recon, const struct checkpoint_sink *sink, struct error *err)
 {
@@ -491,6 +495,9 @@ int recon_save_state(struct recon *recon, const struct checkpoint_sink *sink, st
 		code = sink->write(sink->context, ends_state(recon->ends), ends_state_bytes(recon->ends), err);
 	if (code == 0 && stopping_bytes(recon) > 0)
 		code = sink->write(sink->context, &recon->stopping, sizeof(recon->stopping), err);
+	if (code == 0 && recon->stripes != NULL)
+		code =
+		    sink->write(sink->context, stripes_state(recon->stripes), stripes_state_bytes(recon->stripes), err);
 	if (code == 0 && recon->means != NULL)
 		code = sink->write(sink->context, means_state(recon->means), means_state_bytes(recon->means), err);
 	if (code == 0 && rim_state_bytes(recon->rim) > 0)
@@ -547,6 +554,9 @@ int recon_resume_state(struct recon *recon, const char *bytes, size_t size, stru
 		ends_resume(recon->ends, bytes + own);
 	if (code == 0 && stopping_bytes(recon) > 0)
 		memcpy(&recon->stopping, bytes + own + ends_state_bytes(recon->ends), sizeof(recon->stopping));
+	if (code == 0 && recon->stripes != NULL)
+		stripes_resume(recon->stripes,
+			       bytes + whole - means_state_bytes(recon->means) - stripes_state_bytes(recon->stripes));
 	if (code == 0 && recon->means != NULL)
 		means_resume(recon->means, bytes + whole - means_state_bytes(recon->means));
 	if (code == 0 && rim > 0) /* rim and restraint stand behind the rest */

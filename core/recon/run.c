@@ -392,6 +392,8 @@ static int finish_fdk(struct recon *recon, struct error *err)
 		code = make_means(recon, err);
 	if (code == 0)
 		code = correct(recon, CORRECT_AFTER_FDK, err);
+	if (code == 0 && recon->stripes != NULL)
+		code = stripes_see_fdk(recon->stripes, recon->backend, recon->volume, err);
 	recon->work_done += corrections_work(recipe, &recon->input.linearise);
 	if (code == 0 && is_wanted(recipe, EMIT_FDK))
 		code = keep(recon, "fdk", "fdk", err);

@@ -101,6 +101,26 @@ static int show_means(struct recon *recon, struct volume_norms *norms, struct er
 	return code == 0 ? measure(recon, norms, err) : code;
 }
 
+/* An iterate without stripes that FDK has none of; `before`, which no iteration reads, has the iterate. */
+static int show_stripes(struct recon *recon, struct volume_norms *norms, struct error *err)
+{
+	struct stripes_report report = {0};
+	int code = 0;
+
+	if (recon->stripes == NULL || recon->iteration == 0)
+		return 0;
+	if (recon->alternation == NULL && !recon->smoothed)
+		code = recon->backend->volume_copy(recon->before, recon->volume, err);
+	if (code == 0)
+		code = stripes_show(recon->stripes, recon->backend, recon->volume, &report, err);
+	recon->smoothed = recon->smoothed || report.changed;
+	if (code == 0 && report.changed)
+		code = measure(recon, norms, err);
+	if (code == 0 && recon->ended)
+		warn_stripes(&recon->warnings, &recon->recipe, &report);
+	return code;
+}
+
 /* The end slices of an iterate as they are kept; the last one's are told of where they are uncertain. */
 static int show_ends(struct recon *recon, struct volume_norms *norms, struct error *err)
 {
@@ -128,6 +148,8 @@ int recon_show(struct recon *recon, struct volume_norms *norms, struct error *er
 		code = show_means(recon, norms, err);
 	if (code == 0)
 		code = show_rim(recon, norms, err);
+	if (code == 0)
+		code = show_stripes(recon, norms, err);
 	return code == 0 ? show_ends(recon, norms, err) : code;
 }
 

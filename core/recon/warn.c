@@ -206,6 +206,20 @@ void warn_alternation(const struct warning_sink *sink, const struct recipe *reci
 		    report->amplitude / hu, report->slices);
 }
 
+void warn_stripes(const struct warning_sink *sink, const struct recipe *recipe, const struct stripes_report *report)
+{
+	const double hu = recipe->mu_water / 1000;
+
+	if (report->slices > 0)
+		warning_tell(
+		    sink, "slices_smoothed",
+		    "iterations raised what alternates from slice to slice, which the FDK volume does not show, as at "
+		    "flat ends that lie amid a slice: %d slices of kept volumes are smoothed along z, by up to %.0f HU "
+		    "in the mean of a "
+		    "slice. FDK's volume, or slices of half a row, show whether anything is so",
+		    report->slices, report->amplitude / hu);
+}
+
 void warn_thin(const struct warning_sink *sink, double width)
 {
 	warning_tell(

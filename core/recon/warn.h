@@ -7,6 +7,7 @@
 #include "core/recon/noise.h"
 #include "core/recon/recon.h"
 #include "core/recon/restraint.h"
+#include "core/recon/stripes.h"
 #include "core/warning.h"
 
 /* Warnings of a reconstruction, in words; those of its corrections are in their rows. For core/ only. */
@@ -35,6 +36,8 @@ void warn_settled(const struct warning_sink *sink, const struct recipe *recipe, 
 /* "slices_smoothed": what alternated from slice to slice, seen by no view, was more than a little. */
 void warn_alternation(const struct warning_sink *sink, const struct recipe *recipe,
 		      const struct alternation_report *report);
+/* The same, where FDK did not show what alternated. */
+void warn_stripes(const struct warning_sink *sink, const struct recipe *recipe, const struct stripes_report *report);
 /* "iterations_held_back" and "noise_beside_metal": what the restraint has changed. */
 void warn_restraint(const struct warning_sink *sink, const struct recipe *recipe,
 		    const struct restraint_report *report);

@@ -244,6 +244,45 @@ static void stack_parts(const struct stack_spec *spec, double slice, struct elli
 	}
 }
 
+/* The default beside FDK on rows of 3.2 mm at the detector, 60 views, four rays a pixel. */
+struct beside_fdk {
+	double fdk, last; /* HU */
+	double shown;     /* of what alternates, by the default */
+};
+
+static const double ROW = 3.2 * 620 / 1100; /* mm, at the isocentre */
+
+static struct beside_fdk reconstruct_default(const struct phantom *body, const struct grid *grid)
+{
+	const struct orbit_spec spec = {104, 80, 60, {620, 1100, {1.6, 1.6}, {0, 0}, {0, 0}}, 0, 6};
+	float *truth = malloc(sizeof(*truth) * grid_voxels(grid));
+	struct outcome outcome = {.threads = 1};
+	struct recipe recipe = recipe_on(grid);
+	int emit[] = {EMIT_FDK};
+	struct beside_fdk found;
+	struct scene scene;
+
+	ck_assert_ptr_nonnull(truth);
+	phantom_voxelise(body, grid, 6, truth);
+	recipe.binning = 2;
+	recipe.emit = emit;
+	recipe.emits = 1;
+	recipe.fdk.on = recipe.tv.on = true;
+	recipe_set_algorithm(&recipe, &algorithm_sart);
+	scene_orbit(&scene, &spec);
+	scene_add(&scene, body);
+	run(&scene, &recipe, &outcome);
+	found = (struct beside_fdk){
+	    error_in_object(outcome_volume(&outcome, "fdk"), truth, grid_voxels(grid)),
+	    error_in_object(outcome_volume(&outcome, "final"), truth, grid_voxels(grid)),
+	    shown_alternation(outcome_volume(&outcome, "final"), truth, grid),
+	};
+	outcome_clear(&outcome);
+	scene_clear(&scene);
+	free(truth);
+	return found;
+}
+
 /*
  * What alternates is the object's own. With what views hardly see evened out along z, plates had a thirtieth of their
  * contrast and twice FDK's error.
@@ -252,40 +291,44 @@ START_TEST(alternation_of_the_object_is_kept)
 {
 	static const struct stack_spec stacks[] = {
 	    {9, 25, 1.37, .5, .43, 1.2, 55.7}, {9, 30, 1, .5, .9, 1, 75.6}, {3, 25, 1.27, .5, .9, 1, 53.7}};
-	const double pixel = 3.2 * 620 / 1100, slice = stacks[_i].rows * pixel;
+	const double slice = stacks[_i].rows * ROW;
 	struct ellipsoid parts[10];
 	const struct phantom body = {1 + stacks[_i].plates, parts};
-	/* Four rays a pixel. */
-	const struct orbit_spec spec = {104, 80, 60, {620, 1100, {1.6, 1.6}, {0, 0}, {0, 0}}, 0, 6};
-	struct grid grid = grid_of(34, 34, stacks[_i].slices, 1.5 * pixel, 1.5 * pixel, slice);
-	struct outcome outcome = {.threads = 1};
-	int emit[] = {EMIT_FDK};
-	struct recipe recipe;
-	struct scene scene;
-	float *truth = malloc(sizeof(*truth) * grid_voxels(&grid));
-	double fdk, last, shown;
+	struct grid grid = grid_of(34, 34, stacks[_i].slices, 1.5 * ROW, 1.5 * ROW, slice);
+	struct beside_fdk found;
 
-	ck_assert_ptr_nonnull(truth);
 	grid.origin[2] = (stacks[_i].middle - stacks[_i].slices / 2) * slice;
 	stack_parts(&stacks[_i], slice, parts);
-	phantom_voxelise(&body, &grid, 6, truth);
-	recipe = recipe_on(&grid);
-	recipe.binning = 2;
-	recipe.emit = emit;
-	recipe.emits = 1;
-	recipe.fdk.on = recipe.tv.on = true;
-	recipe_set_algorithm(&recipe, &algorithm_sart);
-	scene_orbit(&scene, &spec);
-	scene_add(&scene, &body);
-	run(&scene, &recipe, &outcome);
-	fdk = error_in_object(outcome_volume(&outcome, "fdk"), truth, grid_voxels(&grid));
-	last = error_in_object(outcome_volume(&outcome, "final"), truth, grid_voxels(&grid));
-	shown = shown_alternation(outcome_volume(&outcome, "final"), truth, &grid);
-	ck_assert_msg(last < fdk && last < stacks[_i].most && shown > 0.8,
-		      "FDK %.1f HU, iterations %.1f, which show %.2f of what alternates", fdk, last, shown);
-	outcome_clear(&outcome);
-	scene_clear(&scene);
-	free(truth);
+	found = reconstruct_default(&body, &grid);
+	ck_assert_msg(found.last < found.fdk && found.last < stacks[_i].most && found.shown > 0.8,
+		      "FDK %.1f HU, iterations %.1f, which show %.2f of what alternates", found.fdk, found.last,
+		      found.shown);
+}
+END_TEST
+
+/*
+ * Flat ends amid a slice, on slices a fifth to a quarter off the rows: slices were raised and lowered in turn, to 140
+ * and 114 HU in all where FDK has 66 and 83, before kept volumes lost what FDK does not show (stripes.h).
+ */
+START_TEST(flat_ends_amid_a_slice_are_not_answered_by_alternation)
+{
+	static const struct {
+		double aside;    /* of a slice's middle from that between two rows, in slices */
+		double from, to; /* the ends, in slices from that slice's middle */
+		double most;     /* HU */
+	} bodies[] = {{.25, -4.25, 4.75, 110}, {.3, -2.6, 2.7, 83}};
+	const double middle = (bodies[_i].from + bodies[_i].to) / 2;
+	struct ellipsoid part = {.shape = SHAPE_CYLINDER,
+				 .semi_axes = {36, 30, (bodies[_i].to - bodies[_i].from) / 2 * ROW},
+				 .centre = {2, -1, (bodies[_i].aside + middle) * ROW},
+				 .density = WATER};
+	const struct phantom body = {1, &part};
+	struct grid grid = grid_of(32, 32, 20, 1.5 * ROW, 1.5 * ROW, ROW);
+	struct beside_fdk found;
+
+	grid.origin[2] = (bodies[_i].aside - 10) * ROW;
+	found = reconstruct_default(&body, &grid);
+	ck_assert_msg(found.last < bodies[_i].most, "FDK %.1f HU, iterations %.1f", found.fdk, found.last);
 }
 END_TEST
 
@@ -300,6 +343,7 @@ Suite *alternation_suite(void)
 	tcase_add_test(tests, kept_volumes_are_smoothed_and_the_iterate_is_not);
 	tcase_add_loop_test(tests, slices_that_no_ray_feeds_are_not_carved, 0, 2);
 	tcase_add_loop_test(tests, alternation_of_the_object_is_kept, 0, 3);
+	tcase_add_loop_test(tests, flat_ends_amid_a_slice_are_not_answered_by_alternation, 0, 2);
 	suite_add_tcase(suite, tests);
 	return suite;
 }
