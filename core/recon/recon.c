@@ -174,13 +174,20 @@ static int open_rim(struct recon *recon, struct error *err)
 static int open_restraint(struct recon *recon, struct error *err)
 {
 	const struct recipe *recipe = &recon->recipe;
-	int code;
 
 	if (!recipe_has_restraint(recipe, &recon->orbit))
 		return 0;
-	code = restraint_new(&recipe->grid, recipe->mu_water, recon->orbit.pixel_at_isocentre[0],
+	return restraint_new(&recipe->grid, recipe->mu_water, recon->orbit.pixel_at_isocentre[0],
 			     recipe->iterate.nonnegative, &recon->restraint, err);
-	return code == 0 ? stripes_new(&recipe->grid, &recon->orbit, recipe->mu_water, &recon->stripes, err) : code;
+}
+
+static int open_stripes(struct recon *recon, struct error *err)
+{
+	const struct recipe *recipe = &recon->recipe;
+
+	return recipe_has_restraint(recipe, &recon->orbit)
+		   ? stripes_new(&recipe->grid, &recon->orbit, recipe->mu_water, &recon->stripes, err)
+		   : 0;
 }
 
 static int open_means(struct recon *recon, struct error *err)
@@ -247,6 +254,8 @@ int recon_open(const struct backend *backend, struct device *device, const struc
 		code = open_rim(recon, err);
 	if (code == 0)
 		code = open_restraint(recon, err);
+	if (code == 0)
+		code = open_stripes(recon, err);
 	if (code == 0)
 		code = open_means(recon, err);
 	if (code == 0 && recon->recipe.algorithm != NULL)
