@@ -18,8 +18,11 @@ static const float OF_FDK = 2;
 enum { NEAR = 1, NEAR_FDK = 2 };
 /* FDK's is kept in a byte, in steps of so many HU. */
 static const float STEP = 4;
-/* Slices at hand at a time: of V, and of A' and a. */
-enum { VALUES = 5, MEANS = 3 };
+/* A row of three that is no cap goes on by so much of its own; FDK's caps are so high, and on a body of so much, HU. */
+static const float GOES_ON = 0.15F;
+static const float CAP = 60, BODY = 500;
+/* Slices at hand at a time: of V, of its means, and of a. */
+enum { VALUES = 6, MEANS = 7, ALTERNATING = 3 };
 /* A slice whose body is smaller says nothing. */
 enum { BODY_LEAST = 16 };
 
@@ -28,15 +31,22 @@ struct stripes {
 	size_t pixels;
 	float hu;           /* 1/mm */
 	float *values;      /* [VALUES] slices, owned; slice z is z % VALUES of them */
-	float *means;       /* [MEANS] slices of A', behind values */
-	float *alternating; /* [MEANS] slices of a, behind means */
+	float *means;       /* [MEANS] slices of M, behind values */
+	float *alternating; /* [ALTERNATING] slices of a, behind means */
 	float *changed;     /* a slice, behind that */
-	unsigned char *fdk; /* behind that, [z][y][x]: FDK's a, in steps; the last one says whether it was seen */
+	unsigned char *fdk; /* behind that, [z][y][x]: FDK's a, in steps */
+	/* behind that, [z][y][x], a bit each: whether FDK has a cap there; the last byte says whether FDK was seen */
+	unsigned char *caps;
 };
 
 static size_t slices_bytes(const struct grid *grid)
 {
-	return (size_t)grid->size[0] * (size_t)grid->size[1] * (VALUES + 2 * MEANS + 1) * sizeof(float);
+	return (size_t)grid->size[0] * (size_t)grid->size[1] * (VALUES + MEANS + ALTERNATING + 1) * sizeof(float);
+}
+
+static size_t caps_bytes(size_t voxels)
+{
+	return (voxels + CHAR_BIT - 1) / CHAR_BIT + 1;
 }
 
 size_t stripes_bytes(const struct grid *grid, const struct orbit *orbit)
@@ -45,7 +55,7 @@ size_t stripes_bytes(const struct grid *grid, const struct orbit *orbit)
 
 	if (!(rows >= ROWS_LEAST && rows <= ROWS_MOST) || orbit->lean != 0 || grid->size[2] < SLICES_LEAST)
 		return 0;
-	return slices_bytes(grid) + grid_voxels(grid) + 1;
+	return slices_bytes(grid) + grid_voxels(grid) + caps_bytes(grid_voxels(grid));
 }
 
 int stripes_new(const struct grid *grid, const struct orbit *orbit, double mu_water, struct stripes **ret_stripes,
@@ -72,8 +82,9 @@ int stripes_new(const struct grid *grid, const struct orbit *orbit, double mu_wa
 	}
 	stripes->means = stripes->values + VALUES * stripes->pixels;
 	stripes->alternating = stripes->means + MEANS * stripes->pixels;
-	stripes->changed = stripes->alternating + MEANS * stripes->pixels;
+	stripes->changed = stripes->alternating + ALTERNATING * stripes->pixels;
 	stripes->fdk = (unsigned char *)(stripes->changed + stripes->pixels);
+	stripes->caps = stripes->fdk + grid_voxels(grid);
 	*ret_stripes = stripes;
 	return 0;
 }
@@ -88,7 +99,9 @@ void stripes_free(struct stripes *stripes)
 
 size_t stripes_state_bytes(const struct stripes *stripes)
 {
-	return stripes != NULL ? stripes->pixels * (size_t)stripes->size[2] + 1 : 0;
+	const size_t voxels = stripes != NULL ? stripes->pixels * (size_t)stripes->size[2] : 0;
+
+	return stripes != NULL ? voxels + caps_bytes(voxels) : 0;
 }
 
 const void *stripes_state(const struct stripes *stripes)
@@ -121,12 +134,12 @@ static const float *values_of(const struct stripes *stripes, int z)
 
 static float *means_of(const struct stripes *stripes, int z)
 {
-	return stripes->means + (size_t)(z % MEANS) * stripes->pixels;
+	return stripes->means + (size_t)(held(z, stripes->size[2]) % MEANS) * stripes->pixels;
 }
 
 static float *alternating_of(const struct stripes *stripes, int z)
 {
-	return stripes->alternating + (size_t)(z % MEANS) * stripes->pixels;
+	return stripes->alternating + (size_t)(z % ALTERNATING) * stripes->pixels;
 }
 
 /* A of a voxel, i its place in the slice. */
@@ -135,15 +148,19 @@ static float away(const struct stripes *stripes, int z, size_t i)
 	return (2 * values_of(stripes, z)[i] - values_of(stripes, z - 1)[i] - values_of(stripes, z + 1)[i]) / 4;
 }
 
-/* A' of slice z, whose neighbours are there; `changed` is worked in. */
+/* A' of a voxel. */
+static float away_in_means(const struct stripes *stripes, int z, size_t i)
+{
+	return (2 * means_of(stripes, z)[i] - means_of(stripes, z - 1)[i] - means_of(stripes, z + 1)[i]) / 4;
+}
+
+/* M of slice z. */
 static void take_means(const struct stripes *stripes, int z)
 {
 	const int columns = stripes->size[0], rows = stripes->size[1];
-	float *all = stripes->changed, *means = means_of(stripes, z);
+	const float *values = values_of(stripes, z);
+	float *means = means_of(stripes, z);
 
-#pragma omp parallel for schedule(static)
-	for (size_t i = 0; i < stripes->pixels; i++)
-		all[i] = away(stripes, z, i);
 #pragma omp parallel for schedule(static)
 	for (int y = 0; y < rows; y++)
 		for (int x = 0; x < columns; x++) {
@@ -151,9 +168,35 @@ static void take_means(const struct stripes *stripes, int z)
 
 			for (int j = y - 1; j <= y + 1; j++)
 				for (int i = x - 1; i <= x + 1; i++)
-					sum += all[(ptrdiff_t)held(j, rows) * columns + held(i, columns)];
+					sum += values[(ptrdiff_t)held(j, rows) * columns + held(i, columns)];
 			means[(ptrdiff_t)y * columns + x] = sum / 9;
 		}
+}
+
+/* FDK stands out along z, from a body. */
+static bool is_cap(const struct stripes *stripes, int z, size_t i)
+{
+	const float before = fminf(means_of(stripes, z - 1)[i], means_of(stripes, z - 2)[i]);
+	const float behind = fminf(means_of(stripes, z + 1)[i], means_of(stripes, z + 2)[i]);
+	const float side = fmaxf(before, behind);
+
+	return side > BODY * stripes->hu && means_of(stripes, z)[i] - side > CAP * stripes->hu;
+}
+
+/* FDK has a cap within a voxel and a slice. */
+static bool near_cap(const struct stripes *stripes, int x, int y, int z)
+{
+	const int columns = stripes->size[0], rows = stripes->size[1], slices = stripes->size[2];
+
+	for (int k = held(z - NEAR, slices); k <= held(z + NEAR, slices); k++)
+		for (int j = held(y - NEAR, rows); j <= held(y + NEAR, rows); j++)
+			for (int i = held(x - NEAR, columns); i <= held(x + NEAR, columns); i++) {
+				const size_t at = (size_t)k * stripes->pixels + (size_t)((ptrdiff_t)j * columns + i);
+
+				if (stripes->caps[at / CHAR_BIT] >> at % CHAR_BIT & 1)
+					return true;
+			}
+	return false;
 }
 
 static float least_of(float before, float here, float behind)
@@ -163,21 +206,37 @@ static float least_of(float before, float here, float behind)
 	return fminf(fabsf(here), fminf(fabsf(before), fabsf(behind)));
 }
 
-/* a of slice z; the grid's first and last slices have none. */
-static void take_alternating(const struct stripes *stripes, int z)
+/* Whether the three slices about z are all that alternates there. */
+static bool ends_there(const struct stripes *stripes, int z, size_t i, float least)
 {
+	return fmaxf(fabsf(away_in_means(stripes, z - 2, i)), fabsf(away_in_means(stripes, z + 2, i))) <=
+	       GOES_ON * least;
+}
+
+/* a of slice z, of FDK or with its caps left out; the grid's first and last slices have none. */
+static void take_alternating(const struct stripes *stripes, int z, bool of_fdk)
+{
+	const int columns = stripes->size[0], rows = stripes->size[1];
 	const bool amid = z > 0 && z + 1 < stripes->size[2];
-	const float *before = means_of(stripes, amid ? z - 1 : z), *behind = means_of(stripes, z + 1);
-	const float *here = means_of(stripes, z);
 	float *alternating = alternating_of(stripes, z);
 
 #pragma omp parallel for schedule(static)
-	for (size_t i = 0; i < stripes->pixels; i++)
-		alternating[i] = amid ? least_of(before[i], here[i], behind[i]) : 0;
+	for (int y = 0; y < rows; y++)
+		for (int x = 0; x < columns; x++) {
+			const size_t i = (size_t)y * (size_t)columns + (size_t)x;
+			float least = 0;
+
+			if (amid)
+				least = least_of(away_in_means(stripes, z - 1, i), away_in_means(stripes, z, i),
+						 away_in_means(stripes, z + 1, i));
+			if (least > 0 && !of_fdk && ends_there(stripes, z, i, least) && near_cap(stripes, x, y, z))
+				least = 0;
+			alternating[i] = least;
+		}
 }
 
-/* Slice z comes; behind it that before has A', and the one before that a. Beyond the last slice none comes any more. */
-static int come(const struct stripes *stripes, const struct backend *backend, struct volume *volume, int z,
+/* Slice z comes, and a of the third before it. Beyond the last slice none comes any more. */
+static int come(const struct stripes *stripes, const struct backend *backend, struct volume *volume, int z, bool of_fdk,
 		struct error *err)
 {
 	const int slices = stripes->size[2];
@@ -186,28 +245,37 @@ static int come(const struct stripes *stripes, const struct backend *backend, st
 	if (z < slices)
 		code = backend->volume_download(volume, z, 1, stripes->values + (size_t)(z % VALUES) * stripes->pixels,
 						err);
-	if (code == 0 && z >= 1 && z <= slices)
-		take_means(stripes, z - 1);
-	if (code == 0 && z >= 2 && z <= slices + 1)
-		take_alternating(stripes, z - 2);
+	if (code == 0 && z < slices)
+		take_means(stripes, z);
+	if (code == 0 && z >= 3 && z < slices + 3)
+		take_alternating(stripes, z - 3, of_fdk);
 	return code;
+}
+
+/* Slice z of FDK, whose a and neighbours' means are there. */
+static void see_slice(const struct stripes *stripes, int z)
+{
+	for (size_t i = 0; i < stripes->pixels; i++) {
+		const size_t at = (size_t)z * stripes->pixels + i;
+		const float steps = ceilf(alternating_of(stripes, z)[i] / (STEP * stripes->hu));
+		const unsigned char bit = (unsigned char)(1U << at % CHAR_BIT);
+
+		stripes->fdk[at] = (unsigned char)fminf(steps, UCHAR_MAX);
+		if (is_cap(stripes, z, i))
+			stripes->caps[at / CHAR_BIT] |= bit;
+		else
+			stripes->caps[at / CHAR_BIT] &= (unsigned char)~bit;
+	}
 }
 
 int stripes_see_fdk(struct stripes *stripes, const struct backend *backend, struct volume *fdk, struct error *err)
 {
 	int code = 0;
 
-	for (int come_now = 0; come_now < stripes->size[2] + 2 && code == 0; come_now++) {
-		const int z = come_now - 2;
-
-		code = come(stripes, backend, fdk, come_now, err);
-		if (code < 0 || z < 0)
-			continue;
-		for (size_t i = 0; i < stripes->pixels; i++) {
-			const float steps = ceilf(alternating_of(stripes, z)[i] / (STEP * stripes->hu));
-
-			stripes->fdk[(size_t)z * stripes->pixels + i] = (unsigned char)fminf(steps, UCHAR_MAX);
-		}
+	for (int come_now = 0; come_now < stripes->size[2] + 3 && code == 0; come_now++) {
+		code = come(stripes, backend, fdk, come_now, true, err);
+		if (code == 0 && come_now >= 3)
+			see_slice(stripes, come_now - 3);
 	}
 	*seen(stripes) = code == 0;
 	return code;
@@ -284,7 +352,7 @@ static void note(const struct stripes *stripes, int z, struct stripes_report *re
 	size_t count = 0;
 
 	for (size_t i = 0; i < stripes->pixels; i++)
-		if (stripes->changed[i] > 500 * stripes->hu) {
+		if (stripes->changed[i] > BODY * stripes->hu) {
 			sum += fabs((double)(stripes->changed[i] - values[i]));
 			count++;
 		}
@@ -302,11 +370,11 @@ int stripes_show(struct stripes *stripes, const struct backend *backend, struct 
 	*ret_report = (struct stripes_report){0};
 	if (*seen(stripes) == 0)
 		return 0;
-	/* A slice wants a of both its neighbours, three slices on. */
-	for (int come_now = 0; come_now < stripes->size[2] + 3 && code == 0; come_now++) {
-		const int z = come_now - 3;
+	/* A slice wants a of both its neighbours, four slices on. */
+	for (int come_now = 0; come_now < stripes->size[2] + 4 && code == 0; come_now++) {
+		const int z = come_now - 4;
 
-		code = come(stripes, backend, volume, come_now, err);
+		code = come(stripes, backend, volume, come_now, false, err);
 		if (code < 0 || z < 0 || !mend(stripes, z))
 			continue;
 		note(stripes, z, ret_report);

@@ -11,11 +11,16 @@
  * Where the detector's rows are about as far apart as slices, projections hardly show what alternates from slice to
  * slice. A flat end amid a slice, which no means over slices explain, makes iterations raise it, by up to 350 HU, and
  * no property of the iterate tells it from a stack of plates. FDK interpolates between rows, and does not raise it:
- * beside flat ends it has next to nothing that alternates, of plates it has about half.
+ * beside flat ends it has next to nothing that alternates, of plates it has about half. A cap a slice thick on a flat
+ * end alternates as well, of which FDK has nothing, but over three slices alone, where iterations raise what falls
+ * slice by slice by less than that; and FDK, though blurred, stands out where the cap is.
  *
- *   A = (-1, 2, -1) / 4 of V along z
- *   a = the least of |A'| in three slices in a row where A' changes its sign twice, else 0; A' is A's mean over
- *       3 x 3 voxels of the slice
+ *   M = the mean of V over 3 x 3 voxels of the slice
+ *   A = (-1, 2, -1) / 4 of V along z, A' the same of M
+ *   a = the least of |A'| in three slices in a row where A' changes its sign twice, else 0. V's is 0 as well where
+ *       |A'| of the slices before and behind these three is at most .15 of it and FDK has a cap within a voxel and a
+ *       slice: FDK's M is more than 60 HU above the least of the two slices on either side, the higher of which is
+ *       above 500 HU
  *   a_V = the most of V's a within a voxel and a slice of the place, a_F that of FDK's within two
  *   e = a_V - 2 a_F - 20 HU, and at least 0
  *   V' = V - g A,  g = e / a_V  e^2 / (e^2 + (25 HU)^2)

@@ -213,10 +213,11 @@ void warn_stripes(const struct warning_sink *sink, const struct recipe *recipe, 
 	if (report->slices > 0)
 		warning_tell(
 		    sink, "slices_smoothed",
-		    "iterations raised what alternates from slice to slice, which the FDK volume does not show, as at "
-		    "flat ends that lie amid a slice: %d slices of kept volumes are smoothed along z, by up to %.0f HU "
-		    "in the mean of a "
-		    "slice. FDK's volume, or slices of half a row, show whether anything is so",
+		    "what alternates from slice to slice by more than twice what the FDK volume shows is "
+		    "taken for what iterations raise at flat ends that lie amid a slice: %d slices of kept "
+		    "volumes are smoothed along z, by up to %.0f HU in the mean of a slice. If the object has a "
+		    "layer about a slice thick there, it may be fainter than it is: FDK's volume shows it, "
+		    "blurred",
 		    report->slices, report->amplitude / hu);
 }
 

@@ -248,6 +248,7 @@ static void stack_parts(const struct stack_spec *spec, double slice, struct elli
 struct beside_fdk {
 	double fdk, last; /* HU */
 	double shown;     /* of what alternates, by the default */
+	bool smoothed;    /* the default's volume was, and it is told */
 };
 
 static const double ROW = 3.2 * 620 / 1100; /* mm, at the isocentre */
@@ -277,6 +278,7 @@ static struct beside_fdk reconstruct_default(const struct phantom *body, const s
 	    error_in_object(outcome_volume(&outcome, "fdk"), truth, grid_voxels(grid)),
 	    error_in_object(outcome_volume(&outcome, "final"), truth, grid_voxels(grid)),
 	    shown_alternation(outcome_volume(&outcome, "final"), truth, grid),
+	    strstr(outcome.warnings, "slices_smoothed: ") != NULL,
 	};
 	if (yield_at > 0)
 		expect_same_after_a_yield(&scene, &recipe, yield_at, &outcome);
@@ -332,6 +334,37 @@ START_TEST(flat_ends_amid_a_slice_are_not_answered_by_alternation)
 	grid.origin[2] = (bodies[_i].aside - 10) * ROW;
 	found = reconstruct_default(&body, &grid, _i == 0 ? 4 : 0);
 	ck_assert_msg(found.last < bodies[_i].most, "FDK %.1f HU, iterations %.1f", found.fdk, found.last);
+	ck_assert(found.smoothed);
+}
+END_TEST
+
+/*
+ * Caps a slice thick, of 1800 HU, on a body with flat ends at the faces of slices, which are a quarter off the rows:
+ * .34 of what alternates was shown, with 221 HU where FDK has 220, before caps were told from what iterations raise
+ * (stripes.h).
+ */
+START_TEST(caps_on_flat_ends_are_kept)
+{
+	const double aside = .25 * ROW;
+	struct ellipsoid parts[] = {
+	    {.shape = SHAPE_CYLINDER, .semi_axes = {36, 30, 5.5 * ROW}, .centre = {2, -1, aside}, .density = WATER},
+	    {.shape = SHAPE_CYLINDER,
+	     .semi_axes = {36, 30, .5 * ROW},
+	     .centre = {2, -1, aside + 5 * ROW},
+	     .density = .8 * WATER},
+	    {.shape = SHAPE_CYLINDER,
+	     .semi_axes = {36, 30, .5 * ROW},
+	     .centre = {2, -1, aside - 5 * ROW},
+	     .density = .8 * WATER}};
+	const struct phantom body = {3, parts};
+	struct grid grid = grid_of(32, 32, 20, 1.5 * ROW, 1.5 * ROW, ROW);
+	struct beside_fdk found;
+
+	grid.origin[2] = aside - 10 * ROW;
+	found = reconstruct_default(&body, &grid, 0);
+	ck_assert_msg(found.last < 0.25 * found.fdk && found.shown > 0.9 && !found.smoothed,
+		      "FDK %.1f HU, iterations %.1f, which show %.2f, smoothed %d", found.fdk, found.last, found.shown,
+		      found.smoothed);
 }
 END_TEST
 
@@ -347,6 +380,7 @@ Suite *alternation_suite(void)
 	tcase_add_loop_test(tests, slices_that_no_ray_feeds_are_not_carved, 0, 2);
 	tcase_add_loop_test(tests, alternation_of_the_object_is_kept, 0, 3);
 	tcase_add_loop_test(tests, flat_ends_amid_a_slice_are_not_answered_by_alternation, 0, 2);
+	tcase_add_test(tests, caps_on_flat_ends_are_kept);
 	suite_add_tcase(suite, tests);
 	return suite;
 }
