@@ -646,17 +646,13 @@ static int decide(const struct correction_job *job, const struct state *state, s
 	return average(job, widths, state->always ? ALWAYS_PASSES : state->mean.passes, model, err);
 }
 
-/* A run that goes on gets its views again, and decides as before. Nobody behind this needs the model of the exterior.
- */
+/* A run that goes on gets its views again, and decides as before. */
 static int apply(const struct correction_job *job, void *context, enum correction_time time, bool *ret_changed,
 		 struct error *err)
 {
-	int code = context != NULL ? decide(job, context, err) : 0;
-
 	(void)time;
 	(void)ret_changed;
-	exterior_volume_clear(job->exterior);
-	return code;
+	return context != NULL ? decide(job, context, err) : 0;
 }
 
 const struct correction correction_averaging = {

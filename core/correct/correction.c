@@ -12,18 +12,20 @@
 extern const struct correction correction_lag, correction_scatter, correction_flat_dark, correction_air_region,
     correction_hardening, correction_defects, correction_samples, correction_truncation, correction_exterior,
     correction_blank_views, correction_metal, correction_dense, correction_averaging, correction_agreement,
-    correction_left_out;
+    correction_left_out, correction_within;
 
 /*
  * In the order in which they run. The detector's lag is of all that it has counted, scatter too. Defects of the map are
  * known before an air region's mean is taken, and hardening is that of line integrals. The exterior goes before what
  * leaves rays out, which it could not see through. Blank views are made up for before metal is looked for. Pixels are
- * averaged when the rays that are left out are known. The check of the geometry changes nothing.
+ * averaged when the rays that are left out are known. The means of truncated rows are FDK's in the end, whatever was
+ * done to them. The check of the geometry changes nothing.
  */
 const struct correction *const corrections[CORRECTION_COUNT] = {
-    &correction_lag,         &correction_scatter, &correction_flat_dark,  &correction_defects,   &correction_air_region,
-    &correction_hardening,   &correction_samples, &correction_truncation, &correction_dense,     &correction_exterior,
-    &correction_blank_views, &correction_metal,   &correction_left_out,   &correction_averaging, &correction_agreement,
+    &correction_lag,        &correction_scatter,   &correction_flat_dark,   &correction_defects,
+    &correction_air_region, &correction_hardening, &correction_samples,     &correction_truncation,
+    &correction_dense,      &correction_exterior,  &correction_blank_views, &correction_metal,
+    &correction_left_out,   &correction_averaging, &correction_within,      &correction_agreement,
 };
 
 static bool is_wanted(const struct correction *row, const struct recipe *recipe, const struct linearise *linearise)

@@ -156,7 +156,7 @@ struct correction {
 	int (*resume)(const struct correction_job *job, void *state, const void *bytes, size_t size, struct error *err);
 };
 
-enum { CORRECTION_COUNT = 15 };
+enum { CORRECTION_COUNT = 16 };
 extern const struct correction *const corrections[CORRECTION_COUNT];
 
 /* The corrections of one reconstruction. */

@@ -45,24 +45,32 @@ static bool is_truncated(const struct ends_known *known, int at, const float *ro
 	       (known->pad[1] == 0 && !covered[1] && truncation_is_cut(row + columns - 1, -1, columns, level));
 }
 
-/* Sums of e and column e over the columns first .. last. */
+/* The columns of a window whose rays are not left out, and sums over them of columns and e. */
 struct stretch {
 	int first, last;
-	double sum, moment;
+	double count, columns, squares, sum, moment;
 };
 
-static void stretch_add(struct stretch *stretch, int column, double e)
+/* Takes a column in (share 1) or out again (-1). */
+static void stretch_add(struct stretch *stretch, const float *measured, const float *explained, int column, int share)
 {
-	stretch->sum += e;
-	stretch->moment += column * e;
+	const double e = (double)measured[column] - (double)explained[column];
+
+	if (isnan(measured[column]))
+		return;
+	stretch->count += share;
+	stretch->columns += share * column;
+	stretch->squares += (double)share * column * column;
+	stretch->sum += share * e;
+	stretch->moment += share * column * e;
 }
 
 /* The straight line nearest to e in the window, at a column. */
 static double line_at(const struct stretch *stretch, int column)
 {
-	const double n = stretch->last - stretch->first + 1, middle = 0.5 * (stretch->first + stretch->last);
-	const double spread = n * (n * n - 1) / 12;
-	const double slope = spread > 0 ? (stretch->moment - middle * stretch->sum) / spread : 0;
+	const double n = fmax(1, stretch->count), middle = stretch->columns / n;
+	const double spread = stretch->squares - middle * stretch->columns;
+	const double slope = stretch->count > 1 ? (stretch->moment - middle * stretch->sum) / spread : 0;
 
 	return stretch->sum / n + slope * (column - middle);
 }
@@ -75,12 +83,10 @@ static void smooth_row(const float *measured, const float *explained, double *re
 
 	for (int c = 0; c < columns; c++) {
 		for (; stretch.last < columns - 1 && stretch.last < c + reach; stretch.last++)
-			stretch_add(&stretch, stretch.last + 1,
-				    (double)measured[stretch.last + 1] - (double)explained[stretch.last + 1]);
+			stretch_add(&stretch, measured, explained, stretch.last + 1, 1);
 		for (; stretch.first < c - reach; stretch.first++)
-			stretch_add(&stretch, stretch.first,
-				    (double)explained[stretch.first] - (double)measured[stretch.first]);
-		ret[c] = line_at(&stretch, c);
+			stretch_add(&stretch, measured, explained, stretch.first, -1);
+		ret[c] = isnan(measured[c]) ? 0 : line_at(&stretch, c);
 	}
 }
 
@@ -92,7 +98,7 @@ static struct exterior_rows subtract_row(const struct projection *of, int row)
 	double *smooth = of->smooth + at, outside = 0;
 	struct exterior_rows found = {0};
 
-	if (of->steps & EXTERIOR_BEYOND && row >= of->seen->first && row <= of->seen->last)
+	if (of->steps & (EXTERIOR_BEYOND | EXTERIOR_WITHIN) && row >= of->seen->first && row <= of->seen->last)
 		found.truncated = 1;
 	else if (of->steps & EXTERIOR_BEYOND)
 		found.truncated = is_truncated(&of->known, row, measured, of->columns, of->largest, of->air);
@@ -225,6 +231,7 @@ int exterior_subtract(const struct exterior_volume *exterior, const struct exter
 	struct exterior_rows found = {0};
 	struct faces faces = {0};
 	struct stack *batch = NULL;
+	const bool within = (steps & EXTERIOR_WITHIN) != 0;
 	bool enough = measured != NULL && explained != NULL && smooth != NULL;
 	int code = 0;
 
@@ -235,7 +242,7 @@ int exterior_subtract(const struct exterior_volume *exterior, const struct exter
 	if (!enough)
 		code = error_set(err, ERR_NO_MEMORY, "no memory for %d views of %d x %d pixels", slots,
 				 geometry->columns, geometry->rows);
-	if (code == 0)
+	if (code == 0 && !within)
 		code = faces_make(&faces, backend, exterior->volume, &exterior->grid, err);
 	if (code == 0 && inside != NULL)
 		code = exterior_volume_sample(exterior, options->grid, work, err);
@@ -245,7 +252,8 @@ int exterior_subtract(const struct exterior_volume *exterior, const struct exter
 	for (int first = 0; first < all && code == 0; first += slots) {
 		const int count = all - first < slots ? all - first : slots;
 
-		code = project(options, exterior->plan, exterior->volume, first, count, batch, explained, err);
+		code = project(options, within ? options->plan : exterior->plan, within ? work : exterior->volume,
+			       first, count, batch, explained, err);
 		if (code == 0 && inside != NULL)
 			code = project(options, options->plan, work, first, count, batch, inside, err);
 		if (code == 0)
@@ -261,7 +269,7 @@ int exterior_subtract(const struct exterior_volume *exterior, const struct exter
 			    .columns = geometry->columns,
 			    .rows = geometry->rows,
 			    .known = {options->orbit->pad, options->dense, first + i},
-			    .faces = options->poor ? NULL : &faces,
+			    .faces = options->poor || within ? NULL : &faces,
 			    .measured = measured + at,
 			    .largest = largest,
 			    .air = air_level(measured + at, geometry->columns, geometry->rows,

@@ -3,12 +3,14 @@
 
 #include "core/correct/exterior_volume.h"
 
+struct correction_job;
+
 /*
  * The exterior, all matter outside of the grid, in SART. A line integral counts all of the
  * object, the grid often holds less of it than the ray meets; SART would pile
  * what lies outside up at the grid's faces and at the rim of the field of view:
  * a bright rim, and hundreds of HU in the middle. So it is taken out of the
- * projections, once, in two steps:
+ * projections, once, in these steps:
  *
  * 1. What lies in the field of view but outside of the grid: a coarse volume w of all that
  *    the rays meet there (core/correct/exterior_volume.h) has it.
@@ -21,10 +23,15 @@
  *    along the length of a body that is truncated in others has all of its shadow, and with it what lies beyond.
  *    Smooth is at each column the value of the straight line fitted to the columns
  *    up to 1/EXTERIOR_PART of the row away from it. So SART keeps FDK's means over
- *    many columns there and adds what is finer. Where a body ends those would be w's means
- *    if its slices were higher than FDK's blur (EXTERIOR_SLICES_OF_A_ROW).
+ *    many columns there and adds what is finer.
+ * 3. Those are w's means, which are coarse along the axis: where a body ends, its last slices were up to three times as
+ *    far from the truth as FDK's, with slices of w as thin as memory goes (EXTERIOR_SLICES_OF_A_ROW). So once nothing
+ *    else changes the projections, p'' - smooth(p'' - A f) in the same rows. f is FDK's volume on the recipe's own
+ *    grid, of the projections before step 1, with w where not all views see a place. Then the means over many columns
+ *    are f's, whatever w lacks. Not of an arc that lacks some degrees, nor with what is very dense: FDK's means are
+ *    wrong by that, too, and iterations make better ones.
  *
- * Where both are there, step 2 goes first, with the start of w: its fit to the projections would otherwise put
+ * Where the first two are there, step 2 goes first, with the start of w: its fit to the projections would otherwise put
  * what lies beyond the field of view into it.
  */
 enum { EXTERIOR_PART = 32 };
@@ -33,7 +40,7 @@ enum { EXTERIOR_PART = 32 };
  * coarse volume cannot hold of the exterior stays in the projections, and each iteration puts more of it into the grid.
  */
 #define EXTERIOR_SETTLED 2
-enum { EXTERIOR_OUTSIDE = 1, EXTERIOR_BEYOND = 2 }; /* the steps, as bits */
+enum { EXTERIOR_OUTSIDE = 1, EXTERIOR_BEYOND = 2, EXTERIOR_WITHIN = 4 }; /* the steps, as bits; the third alone */
 
 /* Numbers of the projections' rows that are concerned. */
 struct exterior_rows {
@@ -50,7 +57,6 @@ struct exterior_rows {
 	bool possible;
 };
 
-struct correction_job;
 /* The inputs of the model; whether FDK is poor is known, and what exterior_look tells is not. */
 struct exterior_volume_options exterior_options_of(const struct correction_job *job);
 
@@ -58,8 +64,18 @@ struct exterior_volume_options exterior_options_of(const struct correction_job *
 int exterior_look(const struct exterior_volume_options *options, struct exterior_rows *ret_rows, struct error *err);
 
 /*
+ * f of step 3, on the host, with the rows that it is of: FDK of the projections as they are, on options->plan, through
+ * `fdk` with nothing pending. `work` is a volume on the recipe's grid to work in. Freed with exterior_volume_clear.
+ */
+int exterior_within_make(struct exterior_volume *exterior, const struct exterior_volume_options *options,
+			 const struct exterior_rows *seen, struct fdk *fdk, struct volume *work, struct error *err);
+/* Puts w where not all views see a place, before exterior_volume_leave_device. */
+int exterior_within_fill(struct exterior_volume *exterior, const struct grid *grid, struct error *err);
+
+/*
  * These steps; seen: what exterior_look found. Changes the projections; `work` is a volume on the recipe's grid to work
- * in, after EXTERIOR_OUTSIDE it holds w. Takes EXTERIOR_VOLUME_VIEWS more slots on the device meanwhile.
+ * in, after EXTERIOR_OUTSIDE it holds w; before EXTERIOR_WITHIN it holds f. Takes EXTERIOR_VOLUME_VIEWS more slots on
+ * the device meanwhile.
  */
 int exterior_subtract(const struct exterior_volume *exterior, const struct exterior_volume_options *options, int steps,
 		      const struct exterior_rows *seen, struct volume *work, struct exterior_rows *ret_rows,

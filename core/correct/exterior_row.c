@@ -32,6 +32,12 @@ static bool wanted(const struct recipe *recipe, const struct linearise *linearis
 	return recipe->algorithm != NULL;
 }
 
+/* An arc that lacks some degrees is in FDK's means over many columns as well. */
+static bool fdk_is_whole(const struct orbit *orbit)
+{
+	return orbit_fdk_is_sound(orbit) && !orbit->arc_too_short;
+}
+
 static int bytes_of(const struct correction_ask *ask, struct correction_bytes *bytes, struct error *err)
 {
 	const struct exterior_volume_options options = {.backend = ask->backend,
@@ -47,6 +53,8 @@ static int bytes_of(const struct correction_ask *ask, struct correction_bytes *b
 	bytes->device += own.device;
 	bytes->borrowed += own.borrowed;
 	bytes->host += own.host;
+	if (ask->recipe->fdk.on && fdk_is_whole(ask->orbit))
+		bytes->aside += grid_voxels(&ask->recipe->grid) * sizeof(float);
 	return 0;
 }
 
@@ -60,7 +68,10 @@ static int subtract(const struct correction_job *job, const struct exterior_volu
 	struct exterior_rows rows = {0};
 	int steps = EXTERIOR_OUTSIDE | (recipe->fdk.extend ? EXTERIOR_BEYOND : 0), code = 0;
 
-	if (exterior->goes_on && seen->truncated > 0 && !options->poor) {
+	/* And so are streaks of what is very dense. */
+	if (seen->truncated > 0 && recipe->fdk.on && fdk_is_whole(job->orbit) && job->dense->traces_count == 0)
+		code = exterior_within_make(exterior, options, seen, job->fdk, job->work, err);
+	if (code == 0 && exterior->goes_on && seen->truncated > 0 && !options->poor) {
 		code = exterior_subtract(exterior, options, EXTERIOR_BEYOND, seen, job->work, &rows, err);
 		steps = EXTERIOR_OUTSIDE;
 	}
@@ -79,6 +90,8 @@ static int subtract(const struct correction_job *job, const struct exterior_volu
 	/* Iterations without FDK start from zero. */
 	if (code == 0 && exterior->goes_on && recipe->fdk.on && *job->iteration == 0)
 		code = exterior_start(exterior, options, job->work, job->volume, err);
+	if (code == 0 && exterior->within != NULL)
+		code = exterior_within_fill(exterior, options->grid, err);
 	if (code == 0)
 		*ret_rows = rows;
 	return code;
@@ -249,7 +262,7 @@ static int apply(const struct correction_job *job, void *state, enum correction_
 	/* Of few photons some rows are taken for such by chance, and what is taken out of them is noise. */
 	if (code == 0 && (seen.certain > 0 || exterior_volume_has_outside(exterior, options.grid)))
 		warn_of_outside(job, rows.outside);
-	if (code == 0 && taken)
+	if (code == 0 && (taken || exterior->within != NULL))
 		exterior_volume_leave_device(exterior);
 	else
 		exterior_volume_clear(exterior);

@@ -148,23 +148,27 @@ void exterior_volume_mean(struct exterior_volume *s, const double variances[3])
 	}
 }
 
+void exterior_volume_slice(const struct exterior_volume *s, const struct grid *grid, int z, float *ret_slice)
+{
+#pragma omp parallel for schedule(static)
+	for (int y = 0; y < grid->size[1]; y++)
+		for (int x = 0; x < grid->size[0]; x++) {
+			const struct corners corners = corners_of_voxel(&s->grid, grid, x, y, z);
+
+			ret_slice[(size_t)y * (size_t)grid->size[0] + (size_t)x] = value_at(s, &corners);
+		}
+}
+
 int exterior_volume_sample(const struct exterior_volume *s, const struct grid *grid, struct volume *to,
 			   struct error *err)
 {
-	const size_t nx = (size_t)grid->size[0];
-	float *slice = malloc(nx * (size_t)grid->size[1] * sizeof(float));
+	float *slice = malloc((size_t)grid->size[0] * (size_t)grid->size[1] * sizeof(float));
 	int code = 0;
 
 	if (slice == NULL)
 		return error_set(err, ERR_NO_MEMORY, "no memory for a slice");
 	for (int z = 0; z < grid->size[2] && code == 0; z++) {
-#pragma omp parallel for schedule(static)
-		for (int y = 0; y < grid->size[1]; y++)
-			for (int x = 0; x < grid->size[0]; x++) {
-				const struct corners corners = corners_of_voxel(&s->grid, grid, x, y, z);
-
-				slice[(size_t)y * nx + (size_t)x] = value_at(s, &corners);
-			}
+		exterior_volume_slice(s, grid, z, slice);
 		code = s->backend->volume_put(to, z, 1, slice, err);
 	}
 	free(slice);

@@ -568,5 +568,6 @@ void exterior_volume_clear(struct exterior_volume *s)
 		return;
 	exterior_volume_leave_device(s);
 	free(s->voxels);
+	free(s->within);
 	*s = (struct exterior_volume){0};
 }

@@ -82,6 +82,8 @@ struct exterior_volume {
 	bool *seen;
 	size_t truncated[2]; /* as of backend.filter_extended */
 	bool goes_on;        /* something is left outside of the recipe's grid */
+	float *within;       /* exterior_within_make's (exterior.h), on the recipe's grid, owned; NULL without */
+	int rows[2];         /* it is of these rows of the projections, the first and the last one */
 };
 
 /*
@@ -130,6 +132,8 @@ void exterior_volume_leave_device(struct exterior_volume *exterior);
  * is empty ([voxels]).
  */
 void exterior_volume_hold_rim(struct exterior_volume *exterior, const struct orbit *orbit, const bool *empty);
+/* A slice of it on the recipe's grid, [y][x]. */
+void exterior_volume_slice(const struct exterior_volume *exterior, const struct grid *grid, int z, float *ret_slice);
 /* `to` becomes the same on the recipe's grid. */
 int exterior_volume_sample(const struct exterior_volume *exterior, const struct grid *grid, struct volume *to,
 			   struct error *err);

@@ -161,8 +161,8 @@ START_TEST(iterations_beside_rods_are_no_worse_than_fdk)
 			continue;
 		fdk = error_of(_i, &grid, &phantom, where, outcome_volume(&outcome, "fdk"), truth);
 		last = error_of(_i, &grid, &phantom, where, outcome_volume(&outcome, "final"), truth);
-		/* What is FDK's again has passed through another sum of floats. */
-		ck_assert_msg(last < 1.0001 * fdk, "%s%s: FDK %.2f HU, default %.2f HU", where_names[where],
+		/* What is FDK's again, in truncated rows through the iterations, has not the same bits. */
+		ck_assert_msg(last < 1.0003 * fdk, "%s%s: FDK %.2f HU, default %.2f HU", where_names[where],
 			      tries[_i].what, fdk, last);
 	}
 	for (int k = 0; k < COUNT(codes); k++)
