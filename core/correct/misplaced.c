@@ -1,5 +1,5 @@
 /* Views that were taken elsewhere than the scan says: see misplaced.h. */
-#include "core/correct/misplaced.h"
+#include "core/correct/misplaced_internal.h"
 
 #include <math.h>
 #include <stdlib.h>
@@ -8,35 +8,11 @@
 #include "core/select.h"
 
 enum { BESIDE_MOST = 3 }; /* places up to the next one that is in */
-enum { AROUND = 10, USUAL_LEAST = 4, VIEWS_LEAST = 24, PIECES_MOST = 96, PIXELS_LEAST = 16, SINGLES_MOST = 4 };
-/* Squares, of what is usual about there: cuts, a join; a single view at its own place, and at another one. */
-static const double CUT = 5, SMALLEST_CUT = 1.5, JOINS = 3, OFF = 6, FITS = 3;
+enum { AROUND = 10, USUAL_LEAST = 4, VIEWS_LEAST = 24, PIXELS_LEAST = 16, SINGLES_MOST = 4 };
+/* Squares, of what is usual about there: a single view at its own place, and at another one. */
+static const double OFF = 6, FITS = 3;
 static const double BETTER = 4; /* times a single view fits better elsewhere */
 static const double SURE = 2;   /* times as much where no other one's place is free for it */
-/*
- * Times, squares: what a run that was stored backwards cuts the ring by at its sides, beside what it leaves there when
- * it is turned about, and beside all other cuts in it and within some places of it.
- */
-static const double PLAIN = 10, ALONE = 3;
-enum { FLANK = 4 };
-enum { TRIES = 16 };
-enum { MOST = 2 }; /* one view in so many */
-
-/* The views that stand in a row along the ring. */
-struct search {
-	const struct ring *ring;
-	const struct view_strips *strips; /* [views] */
-	int samples[2];
-	double gap;    /* radians from a view to the next, in the mean */
-	int *views;    /* [count], of the places in the order that was found so far */
-	double *apart; /* [count], of a place from the next, mean squares */
-	double *usual; /* [count] */
-	int *work;     /* [count] */
-	double *costs; /* [PIECES_MOST][PIECES_MOST] */
-	bool *out;     /* [count], places whose view does not belong there */
-	bool *known;   /* [count], places that were looked at */
-	bool *sure;    /* [count], of those that are out */
-};
 
 /* A side of the detector, an eighth of it. */
 enum side { NO_SIDE, FIRST_COLUMNS, LAST_COLUMNS, FIRST_ROWS, LAST_ROWS, SIDES };
@@ -93,7 +69,7 @@ static double between_whatever_level(const struct search *search, int view, int 
 	return fmin(off, beside_level(search, view, before, behind, share, without, level, &rest));
 }
 
-static double apart_of(const struct search *search, int a, int b)
+double misplaced_apart(const struct search *search, int a, int b)
 {
 	return between(search, a, b, b, 0, NO_SIDE);
 }
@@ -118,8 +94,7 @@ static double share_between(const struct search *search, int view, int before, i
 	return square > 0 ? fmin(1, fmax(0, product / square)) : 0.5;
 }
 
-/* What a third of the values about each place do not exceed, itself excepted. */
-static void make_usual(const struct search *search, const double *values, double *ret)
+void misplaced_usual(const struct search *search, const double *values, double *ret)
 {
 	const int count = search->ring->count;
 
@@ -137,293 +112,6 @@ static void make_usual(const struct search *search, const double *values, double
 	}
 }
 
-/* ---- the order ---- */
-
-/* The views between two cuts: places from first to before end, which may lie beyond the ring's count. */
-struct piece {
-	int first, end;
-	bool fixed; /* stays behind the piece before it */
-};
-
-static bool is_fixed(const struct ring *ring, int place)
-{
-	return !ring_is_near(ring, place);
-}
-
-static bool is_cut(const struct search *search, int place, double cut)
-{
-	return is_fixed(search->ring, place) || search->apart[place] > cut * search->usual[place];
-}
-
-static int make_pieces(const struct search *search, double cut, struct piece pieces[PIECES_MOST])
-{
-	const int count = search->ring->count;
-	int first = -1, pieces_count = 0;
-
-	for (int i = 0; i < count && first < 0; i++)
-		if (is_cut(search, i, cut))
-			first = i + 1;
-	for (int k = 0, from = first; first >= 0 && k < count; k++) {
-		const int place = (first + k) % count;
-
-		if (!is_cut(search, place, cut))
-			continue;
-		if (pieces_count == PIECES_MOST)
-			return 0;
-		pieces[pieces_count++] =
-		    (struct piece){from, first + k + 1, is_fixed(search->ring, (from - 1 + count) % count)};
-		from = first + k + 1;
-	}
-	return pieces_count;
-}
-
-/* What it costs that a piece stands behind another one: squares, of what is usual there; INFINITY: it cannot. */
-static double cost_of(const struct search *search, const struct piece *pieces, int count, int before, int piece)
-{
-	const int all = search->ring->count;
-	const int end = (pieces[before].end - 1) % all, start = pieces[piece].first % all;
-
-	/* What a gap in the scan follows stays before it. */
-	if (before == piece || pieces[piece].fixed || pieces[(before + 1) % count].fixed)
-		return INFINITY;
-	return apart_of(search, search->views[end], search->views[start]) /
-	       fmax(search->usual[end], search->usual[(start - 1 + all) % all]);
-}
-
-/*
- * For each piece the one that it joins, the closest ones first; all that join none stay where they are. False where
- * they cannot. costs: [count][count], work.
- */
-static bool join(const struct search *search, const struct piece *pieces, int count, double *costs, int *ret_before)
-{
-	bool taken[PIECES_MOST] = {false};
-
-	for (int i = 0; i < count * count; i++)
-		costs[i] = cost_of(search, pieces, count, i % count, i / count);
-	for (int p = 0; p < count; p++)
-		ret_before[p] = -1;
-	for (int k = 0; k < count; k++) {
-		int best = 0;
-
-		for (int i = 1; i < count * count; i++)
-			best = costs[i] < costs[best] ? i : best;
-		if (!(costs[best] <= JOINS))
-			break;
-		ret_before[best / count] = best % count;
-		taken[best % count] = true;
-		for (int i = 0; i < count; i++)
-			costs[best / count * count + i] = costs[i * count + best % count] = INFINITY;
-	}
-	for (int p = 0; p < count; p++) {
-		const int own = (p + count - 1) % count;
-
-		if (ret_before[p] >= 0)
-			continue;
-		if (taken[own])
-			return false;
-		taken[own] = true;
-		ret_before[p] = own;
-	}
-	return true;
-}
-
-/* Puts the pieces one behind the other, from the longest on; returns how many views are elsewhere then. */
-static int put_in_order(const struct search *search, const struct piece *pieces, int count, const int *before,
-			int *ret_views)
-{
-	const int all = search->ring->count;
-	int behind[PIECES_MOST], longest = 0, place, moved = 0, piece;
-
-	for (int p = 0; p < count; p++) {
-		behind[before[p]] = p;
-		if (pieces[p].end - pieces[p].first > pieces[longest].end - pieces[longest].first)
-			longest = p;
-	}
-	piece = longest;
-	place = pieces[longest].first;
-	for (int k = 0; k < count; k++) {
-		for (int i = pieces[piece].first; i < pieces[piece].end; i++, place++) {
-			ret_views[place % all] = search->views[i % all];
-			moved += place % all != i % all;
-		}
-		piece = behind[piece];
-		if (piece == longest && k + 1 < count)
-			return 0;
-	}
-	return moved;
-}
-
-/* True if a view may stand right behind another one, at a place. */
-static bool joins(const struct search *search, int before, int behind, int place)
-{
-	return apart_of(search, search->views[before], search->views[behind]) <= JOINS * search->usual[place];
-}
-
-static void turn_about(const struct search *search, int first, int end)
-{
-	const int all = search->ring->count;
-
-	for (int i = first, k = end - 1; i < k; i++, k--) {
-		const int view = search->views[i % all];
-
-		search->views[i % all] = search->views[k % all];
-		search->views[k % all] = view;
-	}
-}
-
-/* True if a piece joins what lies on both sides when it is turned about. */
-static bool is_backward(const struct search *search, const struct piece *piece)
-{
-	const int all = search->ring->count;
-	const int first = piece->first % all, last = (piece->end - 1) % all, before = (first + all - 1) % all;
-
-	return piece->end - piece->first > 1 && !is_fixed(search->ring, before) && !is_fixed(search->ring, last) &&
-	       joins(search, before, last, before) && joins(search, first, (last + 1) % all, last);
-}
-
-/*
- * Turns pieces about that were stored backwards, where that leaves no cut; returns how many views are elsewhere then.
- * Two views that are exchanged let what lies between them look so, too, but leave cuts.
- */
-static int turn_backward_ones(const struct search *search, const struct piece *pieces, int count)
-{
-	const int all = search->ring->count;
-	bool backward[PIECES_MOST];
-	int cuts = 0, moved = 0;
-
-	for (int p = 0; p < count; p++) {
-		const int length = pieces[p].end - pieces[p].first;
-
-		backward[p] = MOST * length <= all && is_backward(search, &pieces[p]);
-		cuts += !pieces[p].fixed - 2 * backward[p];
-		moved += backward[p] ? length / 2 * 2 : 0;
-	}
-	if (cuts != 0 || MOST * moved > all)
-		return 0;
-	for (int p = 0; p < count; p++)
-		if (backward[p])
-			turn_about(search, pieces[p].first, pieces[p].end);
-	return moved;
-}
-
-/* Finds the order of the views with cuts of this size; returns how many are not where they were. */
-static int find_order_of(const struct search *search, double cut)
-{
-	const int count = search->ring->count;
-	struct piece pieces[PIECES_MOST];
-	const int pieces_count = make_pieces(search, cut, pieces);
-	int before[PIECES_MOST], moved;
-
-	if (pieces_count < 3 || !join(search, pieces, pieces_count, search->costs, before))
-		return turn_backward_ones(search, pieces, pieces_count);
-	moved = put_in_order(search, pieces, pieces_count, before, search->work);
-	if (moved == 0)
-		return turn_backward_ones(search, pieces, pieces_count);
-	if (MOST * moved > count)
-		return 0;
-	for (int i = 0; i < count; i++)
-		search->views[i] = search->work[i];
-	return moved;
-}
-
-/* The largest step that is no cut of this size, as a cut; 0: there is none. */
-static double next_cut(const struct search *search, double cut)
-{
-	double next = 0;
-
-	for (int i = 0; i < search->ring->count; i++)
-		if (!is_cut(search, i, cut))
-			next = fmax(next, search->apart[i] / search->usual[i]);
-	return next * (1 - 1e-9);
-}
-
-/* The cut from a place to the next one where it is plain, and what is left of it with two other views there; false: it
- * is no such cut. Where a gap in the scan follows it there is none. */
-static bool is_plain(const struct search *search, int place, int before, int behind, double *ret_cut)
-{
-	const double cut = search->apart[place];
-
-	*ret_cut = INFINITY;
-	if (is_fixed(search->ring, place))
-		return true;
-	*ret_cut = cut;
-	return cut > CUT * search->usual[place] &&
-	       PLAIN * apart_of(search, search->views[before], search->views[behind]) <= cut;
-}
-
-/* True if the ring has no gap and no cut at a place that is one beside that. */
-static bool is_quiet(const struct search *search, int place, double cut)
-{
-	const int at = place % search->ring->count;
-
-	return !is_fixed(search->ring, at) && ALONE * search->apart[at] <= cut;
-}
-
-/*
- * True if the views behind a place up to another one were stored backwards: both sides are plainly cut, all but nothing
- * of that is left when they are turned about, and nothing else in them and near by is cut like that, as where something
- * comes and goes, or where runs are exchanged. At an end of the scan there is one side.
- */
-static bool is_backward_run(const struct search *search, int before, int last)
-{
-	const int all = search->ring->count, first = (before + 1) % all, behind = (last + 1) % all;
-	const int length = (last - before + all) % all;
-	double cuts[2], least;
-
-	if (length < 2 || MOST * length > all || (is_fixed(search->ring, before) && is_fixed(search->ring, last)) ||
-	    !is_plain(search, before, before, last, &cuts[0]) || !is_plain(search, last, first, behind, &cuts[1]))
-		return false;
-	least = fmin(cuts[0], cuts[1]);
-	for (int k = 1; k < length; k++)
-		if (!is_quiet(search, before + k, least))
-			return false;
-	/* What lies beyond a gap in the scan is not near by. */
-	for (int k = 0; k < FLANK && !is_fixed(search->ring, (before - k + all) % all); k++)
-		if (k > 0 && !is_quiet(search, before - k + all, least))
-			return false;
-	for (int k = 0; k < FLANK && !is_fixed(search->ring, (last + k) % all); k++)
-		if (k > 0 && !is_quiet(search, last + k, least))
-			return false;
-	return true;
-}
-
-static void turn_backward_runs(const struct search *search)
-{
-	const int all = search->ring->count;
-
-	for (int before = 0; before < all; before++)
-		for (int length = 2; MOST * length <= all; length++)
-			if (is_backward_run(search, before, (before + length) % all)) {
-				turn_about(search, before + 1, before + length + 1);
-				before += length;
-				break;
-			}
-}
-
-/* Where views far from each other look alike, a cut between them is small: smaller ones are added one by one. */
-static void find_order(const struct search *search)
-{
-	const int count = search->ring->count;
-	double size = CUT;
-	bool cut = false;
-
-	for (int i = 0; i < count; i++)
-		search->apart[i] = is_fixed(search->ring, i)
-				       ? INFINITY
-				       : apart_of(search, search->views[i], search->views[(i + 1) % count]) /
-					     fmax(1, pow(ring_turn(search->ring, i, (i + 1) % count) / search->gap, 2));
-	make_usual(search, search->apart, search->usual);
-	for (int i = 0; i < count; i++)
-		cut = cut || (!is_fixed(search->ring, i) && is_cut(search, i, CUT));
-	for (int tries = 0; tries < TRIES && cut && size > SMALLEST_CUT; tries++) {
-		if (find_order_of(search, size) > 0)
-			return;
-		size = next_cut(search, size);
-	}
-	if (cut)
-		turn_backward_runs(search);
-}
-
 /* ---- single views ---- */
 
 /* The next place that is still in, on one side; -1 where a gap in the scan lies between or it is too far away. */
@@ -434,7 +122,7 @@ static int beside(const struct search *search, int place, int side)
 	for (int k = 1; k <= BESIDE_MOST; k++) {
 		const int at = (place + side * k + 2 * count) % count;
 
-		if (is_fixed(search->ring, side > 0 ? (at - 1 + count) % count : at))
+		if (!ring_is_near(search->ring, side > 0 ? (at - 1 + count) % count : at))
 			return -1;
 		if (!search->out[at])
 			return at;
@@ -510,7 +198,7 @@ static void look_at_singles(const struct search *search)
 		search->apart[i] = search->out[i] ? INFINITY
 						  : off_at(search, search->views[i], i, beside(search, i, -1),
 							   beside(search, i, 1), NO_SIDE);
-	make_usual(search, search->apart, search->usual);
+	misplaced_usual(search, search->apart, search->usual);
 }
 
 /*
@@ -610,7 +298,7 @@ static int find(const struct ring *ring, const struct view_strips *strips, const
 	int found = 0;
 
 	search.views = malloc(2 * count * sizeof(*search.views));
-	search.apart = malloc((2 * count + PIECES_MOST * PIECES_MOST) * sizeof(*search.apart));
+	search.apart = malloc((2 * count + MISPLACED_PIECES * MISPLACED_PIECES) * sizeof(*search.apart));
 	search.out = calloc(3 * count, sizeof(*search.out));
 	if (search.views == NULL || search.apart == NULL || search.out == NULL) {
 		found = error_set(err, ERR_NO_MEMORY, "no memory for the order of %d views", ring->count);
@@ -625,7 +313,7 @@ static int find(const struct ring *ring, const struct view_strips *strips, const
 			search.samples[a] = pixels[a] < NARROW_SAMPLES ? pixels[a] : NARROW_SAMPLES;
 		for (int i = 0; i < ring->count; i++)
 			search.views[i] = ring->places[i].view;
-		find_order(&search);
+		misplaced_order(&search);
 		find_singles(&search);
 		found = mark(&search, ret_steps);
 	}
