@@ -13,36 +13,52 @@ enum { AROUND = 10, USUAL_LEAST = 4, VIEWS_LEAST = 24, PIXELS_LEAST = 16, SINGLE
 static const double OFF = 6, FITS = 3;
 static const double BETTER = 4; /* times a single view fits better elsewhere */
 static const double SURE = 2;   /* times as much where no other one's place is free for it */
+/*
+ * Of what views show: what is usual is no less than the first, or rounding is unusual where an object is round and
+ * there is no noise. What is off by less than the second, squares OFF times as much, is faint: below one HU of the
+ * image.
+ */
+static const double LEAST = 1e-4, FAINT = 1e-3;
 
-/* A side of the detector, an eighth of it. */
-enum side { NO_SIDE, FIRST_COLUMNS, LAST_COLUMNS, FIRST_ROWS, LAST_ROWS, SIDES };
+enum { GUESS_MOST = 4 };
+/* What is expected of a view: so much of each of some others. */
+struct guess {
+	int count;
+	int views[GUESS_MOST];
+	float shares[GUESS_MOST];
+};
 
-/* True for a sample of a strip along an axis (narrow.h) that lies on this side. */
-static bool is_on(enum side side, int axis, int strip, int sample, int samples)
+/* Eighths of the detector, a bit each: of its columns, and behind those of its rows. */
+enum { EIGHTHS = NARROW_STRIPS, NOTHING = 0 };
+
+static unsigned eighth(int across, int at)
 {
-	const int across = side == FIRST_ROWS || side == LAST_ROWS;
-	const int at = axis == across ? sample * NARROW_STRIPS / samples : strip;
-
-	return side != NO_SIDE && at == (side == FIRST_COLUMNS || side == FIRST_ROWS ? 0 : NARROW_STRIPS - 1);
+	return 1U << (across * EIGHTHS + at);
 }
 
-/* How far a view's strips, but for one side of the detector, are off what lies between those of two others and a level:
- * the squared mean, so that little of a view, as a plate seen from its edge, counts for little. */
-static double beside_level(const struct search *search, int view, int before, int behind, double share,
-			   enum side without, float level, float *ret_level)
+/* The eighths, of columns and rows, that a sample of a strip along an axis (narrow.h) lies in. */
+static unsigned eighths_of(int axis, int strip, int sample, int samples)
 {
-	const struct view_strips *v = &search->strips[view], *a = &search->strips[before], *b = &search->strips[behind];
-	const float part = (float)share;
+	return eighth(axis, sample * EIGHTHS / samples) | eighth(1 - axis, strip);
+}
+
+/* How far a view's strips, but for some eighths of the detector, are off what is expected of it and a level: the
+ * squared mean, so that little of a view, as a plate seen from its edge, counts for little. */
+static double off_level(const struct search *search, int view, const struct guess *guess, unsigned without, float level,
+			float *ret_level)
+{
+	const struct view_strips *v = &search->strips[view];
 	double sum = 0, all = 0;
 	int count = 0;
 
 	for (int axis = 0; axis < 2; axis++)
 		for (int s = 0; s < NARROW_STRIPS; s++)
 			for (int i = 0; i < search->samples[axis]; i++) {
-				const float p = a->p[axis][s][i], q = b->p[axis][s][i];
-				const float off = v->p[axis][s][i] - p - part * (q - p);
+				float off = v->p[axis][s][i];
 
-				if (isnan(off) || is_on(without, axis, s, i, search->samples[axis]))
+				for (int k = 0; k < guess->count; k++)
+					off -= guess->shares[k] * search->strips[guess->views[k]].p[axis][s][i];
+				if (isnan(off) || (without & eighths_of(axis, s, i, search->samples[axis])) != 0)
 					continue;
 				sum += (double)fabsf(off - level);
 				all += (double)off;
@@ -52,26 +68,32 @@ static double beside_level(const struct search *search, int view, int before, in
 	return count > 0 ? pow(sum / count, 2) : INFINITY;
 }
 
-static double between(const struct search *search, int view, int before, int behind, double share, enum side without)
+static double off_guess(const struct search *search, int view, const struct guess *guess, unsigned without)
 {
 	float level;
 
-	return beside_level(search, view, before, behind, share, without, 0, &level);
+	return off_level(search, view, guess, without, 0, &level);
 }
 
 /* The same, or what is left without the level that all of the view is off by, if that is less. */
-static double between_whatever_level(const struct search *search, int view, int before, int behind, double share,
-				     enum side without)
+static double off_guess_whatever_level(const struct search *search, int view, const struct guess *guess,
+				       unsigned without)
 {
 	float level, rest;
-	const double off = beside_level(search, view, before, behind, share, without, 0, &level);
+	const double off = off_level(search, view, guess, without, 0, &level);
 
-	return fmin(off, beside_level(search, view, before, behind, share, without, level, &rest));
+	return fmin(off, off_level(search, view, guess, without, level, &rest));
+}
+
+/* What lies between two views. */
+static struct guess guess_between(int before, int behind, double share)
+{
+	return (struct guess){2, {before, behind}, {(float)(1 - share), (float)share}};
 }
 
 double misplaced_apart(const struct search *search, int a, int b)
 {
-	return between(search, a, b, b, 0, NO_SIDE);
+	return off_guess(search, a, &(struct guess){1, {b}, {1}}, NOTHING);
 }
 
 /* The share of the second of two views at which a view lies best between them, 0 to 1. */
@@ -108,7 +130,8 @@ void misplaced_usual(const struct search *search, const double *values, double *
 			if (k != 0 && ring_place(search->ring, i + k) != NULL && isfinite(values[at]))
 				around[known++] = (float)values[at];
 		}
-		ret[i] = known >= USUAL_LEAST ? (double)select_kth(around, known, known / 3) : INFINITY;
+		ret[i] =
+		    known >= USUAL_LEAST ? fmax((double)select_kth(around, known, known / 3), search->least) : INFINITY;
 	}
 }
 
@@ -140,32 +163,65 @@ static bool closes(const struct search *search, int before, int behind)
 }
 
 /* How far a view would lie off at a place, as if the views beside it stood next to it; INFINITY: not known. */
-static double off_at(const struct search *search, int view, int place, int before, int behind, enum side without)
+static double off_at(const struct search *search, int view, int place, int before, int behind, unsigned without)
 {
 	const struct ring *ring = search->ring;
+	struct guess guess;
 	double from, to, off;
 
 	if (before < 0 || behind < 0 || before == behind)
 		return INFINITY;
 	from = ring_turn(ring, before, place);
 	to = ring_turn(ring, place, behind);
-	off = closes(search, before, behind)
-		  ? between_whatever_level(search, view, search->views[before], search->views[behind],
-					   from / (from + to), without)
-		  : between(search, view, search->views[before], search->views[behind], from / (from + to), without);
+	guess = guess_between(search->views[before], search->views[behind], from / (from + to));
+	off = closes(search, before, behind) ? off_guess_whatever_level(search, view, &guess, without)
+					     : off_guess(search, view, &guess, without);
 	return off / fmax(1, pow(from * to / (search->gap * search->gap), 2));
 }
 
-/* At its own place: the least of three, so that one view beside it may be wrong. */
-static double off_of(const struct search *search, int place, enum side without)
+/*
+ * How far a view lies off the cubic through two views on either side, in the order of their angles. What an object
+ * looks like goes by sines of the angle: a smooth one that is seen without noise lies off the straight way between its
+ * neighbours by far more where these bend than where they do not, which is no reason to take it for misplaced. Infinite
+ * or not a number where two views stand at one angle.
+ */
+static double off_cubic(const struct search *search, int place, const int around[4], unsigned without)
+{
+	const int view = search->views[place];
+	struct guess guess = {.count = 4};
+	double at[4];
+
+	for (int i = 0; i < 4; i++) {
+		if (around[i] < 0)
+			return INFINITY;
+		guess.views[i] = search->views[around[i]];
+		at[i] = i < 2 ? -ring_turn(search->ring, around[i], place) : ring_turn(search->ring, place, around[i]);
+	}
+	for (int i = 0; i < 4; i++) {
+		double share = 1;
+
+		for (int k = 0; k < 4; k++)
+			share *= k == i ? 1 : at[k] / (at[k] - at[i]);
+		guess.shares[i] = (float)share;
+	}
+	return closes(search, around[0], around[3]) ? off_guess_whatever_level(search, view, &guess, without)
+						    : off_guess(search, view, &guess, without);
+}
+
+/* At its own place: the least of three, so that one view beside it may be wrong, and of the cubic. */
+static double off_of(const struct search *search, int place, unsigned without)
 {
 	const int view = search->views[place], before = beside(search, place, -1), behind = beside(search, place, 1);
 	double off = off_at(search, view, place, before, behind, without);
+	int around[4] = {-1, before, behind, -1};
 
 	if (!isfinite(off))
 		return off;
-	off = fmin(off, off_at(search, view, place, beside(search, before, -1), behind, without));
-	return fmin(off, off_at(search, view, place, before, beside(search, behind, 1), without));
+	around[0] = beside(search, before, -1);
+	around[3] = beside(search, behind, 1);
+	off = fmin(off, off_at(search, view, place, around[0], behind, without));
+	off = fmin(off, off_at(search, view, place, before, around[3], without));
+	return fmin(off, off_cubic(search, place, around, without));
 }
 
 /* True if the view lies between two others as well as views usually do, whatever stands between those; better: times
@@ -178,12 +234,14 @@ static bool fits_elsewhere(const struct search *search, int place, double off, d
 		int next = search->out[k] || k == place ? -1 : beside(search, k, 1);
 
 		for (int skipped = 0; skipped < 2 && next >= 0; skipped++) {
+			struct guess guess;
 			double left;
 
 			if (next == place)
 				break;
-			left = between(search, view, search->views[k], search->views[next],
-				       share_between(search, view, search->views[k], search->views[next]), NO_SIDE);
+			guess = guess_between(search->views[k], search->views[next],
+					      share_between(search, view, search->views[k], search->views[next]));
+			left = off_guess(search, view, &guess, NOTHING);
 			if (left <= FITS * fmin(search->usual[k], search->usual[next]) && better * left <= off)
 				return true;
 			next = beside(search, next, 1);
@@ -197,19 +255,34 @@ static void look_at_singles(const struct search *search)
 	for (int i = 0; i < search->ring->count; i++)
 		search->apart[i] = search->out[i] ? INFINITY
 						  : off_at(search, search->views[i], i, beside(search, i, -1),
-							   beside(search, i, 1), NO_SIDE);
+							   beside(search, i, 1), NOTHING);
 	misplaced_usual(search, search->apart, search->usual);
 }
 
-/*
- * True if a view lies off on one side of the detector alone: there something comes in from beyond it, as the end of a
- * table's board, which is between two views what it is in neither. A view that was taken elsewhere is off all over.
- */
-static bool is_off_at_a_side(const struct search *search, int place)
+static bool is_off_without(const struct search *search, int place, unsigned without)
 {
-	for (enum side side = FIRST_COLUMNS; side < SIDES; side++)
-		if (!(off_of(search, place, side) > OFF * search->usual[place]))
+	return off_of(search, place, without) > OFF * search->usual[place];
+}
+
+/*
+ * True if a view lies off in a part of the detector alone. On one side of it something comes in from beyond, as the end
+ * of a table's board, which is between two views what it is in neither. And what is faint may be the object's borders
+ * alone, one or two of them, that move on from one column or row to the next, and are blurred by none. A view that was
+ * taken elsewhere is off all over.
+ */
+static bool is_off_in_a_part(const struct search *search, int place, double off)
+{
+	const bool faint = off <= OFF * search->faint;
+
+	for (int across = 0; across < 2; across++) {
+		if (!is_off_without(search, place, eighth(across, 0)) ||
+		    !is_off_without(search, place, eighth(across, EIGHTHS - 1)))
 			return true;
+		for (int a = 0; a < EIGHTHS && faint; a++)
+			for (int b = 0; b <= a; b++)
+				if (!is_off_without(search, place, eighth(across, a) | eighth(across, b)))
+					return true;
+	}
 	return false;
 }
 
@@ -233,9 +306,9 @@ static void find_singles(const struct search *search)
 		if (worst < 0)
 			return;
 		known[worst] = true;
-		off = off_of(search, worst, NO_SIDE);
-		if (!(off > OFF * search->usual[worst]) || is_off_at_a_side(search, worst) ||
-		    !fits_elsewhere(search, worst, off, BETTER))
+		off = off_of(search, worst, NOTHING);
+		if (!(off > OFF * search->usual[worst]) || !fits_elsewhere(search, worst, off, BETTER) ||
+		    is_off_in_a_part(search, worst, off))
 			continue;
 		search->sure[worst] =
 		    off > SURE * OFF * search->usual[worst] && fits_elsewhere(search, worst, off, SURE * BETTER);
@@ -255,7 +328,7 @@ static int from_for(const struct search *search, int place)
 	for (int i = 0; i < search->ring->count; i++) {
 		if (!search->out[i] || i == place ||
 		    !(off_at(search, search->views[i], place, beside(search, place, -1), beside(search, place, 1),
-			     NO_SIDE) <= FITS * search->usual[place]))
+			     NOTHING) <= FITS * search->usual[place]))
 			continue;
 		if (from >= 0)
 			return -1;
@@ -290,11 +363,33 @@ static int mark(const struct search *search, struct step *ret_steps)
 	return found;
 }
 
+/* The mean over all samples of all views. */
+static double shown_of(const struct search *search)
+{
+	double sum = 0;
+	long long count = 0;
+
+	for (int place = 0; place < search->ring->count; place++) {
+		const struct view_strips *strips = &search->strips[search->ring->places[place].view];
+
+		for (int axis = 0; axis < 2; axis++)
+			for (int s = 0; s < NARROW_STRIPS; s++)
+				for (int i = 0; i < search->samples[axis]; i++) {
+					const float p = strips->p[axis][s][i];
+
+					sum += isnan(p) ? 0 : (double)fabsf(p);
+					count += !isnan(p);
+				}
+	}
+	return count > 0 ? sum / (double)count : 0;
+}
+
 static int find(const struct ring *ring, const struct view_strips *strips, const int pixels[2], struct step *ret_steps,
 		struct error *err)
 {
 	const size_t count = (size_t)ring->count;
 	struct search search = {.ring = ring, .strips = strips};
+	double shown;
 	int found = 0;
 
 	search.views = malloc(2 * count * sizeof(*search.views));
@@ -313,6 +408,9 @@ static int find(const struct ring *ring, const struct view_strips *strips, const
 			search.samples[a] = pixels[a] < NARROW_SAMPLES ? pixels[a] : NARROW_SAMPLES;
 		for (int i = 0; i < ring->count; i++)
 			search.views[i] = ring->places[i].view;
+		shown = shown_of(&search);
+		search.least = pow(LEAST * shown, 2);
+		search.faint = pow(FAINT * shown, 2);
 		misplaced_order(&search);
 		find_singles(&search);
 		found = mark(&search, ret_steps);

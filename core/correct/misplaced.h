@@ -11,12 +11,14 @@
  * views is cut into pieces. If the pieces in another order have no such cut, each joined to the one that goes on where
  * it ends, that is the order in which they were taken, and the views are put there. A piece that joins both of its
  * neighbours when it is turned about was stored backwards. What an object does by itself, a
- * plate seen from its edge or a jerk of the patient, cuts the ring as well, but no other order mends that. Where no
+ * plate seen from its edge or a jerk of the patient, cuts the ring as well, but no other order mends that; and where no
+ * step is much beside what views show, as of an object that is nearly round, no order is sought. Where no
  * order is found, a run is turned about that is plainly cut off at both sides, at an end of the scan at the one, and is
  * not when it is turned about.
  *
- * A single view that lies far off what the views on both sides let be expected, and that lies between two other ones as
- * well as views usually do, is left out; not one that is off at one side of the detector alone.
+ * A single view that lies far off what the views on both sides let be expected, along straight ways and a cubic, and
+ * that lies between two other ones as well as views usually do, is left out; not one that is off at one side of the
+ * detector alone, or by little and in a quarter of it.
  */
 
 /*

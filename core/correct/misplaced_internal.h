@@ -14,6 +14,8 @@ struct search {
 	const struct view_strips *strips; /* [views] */
 	int samples[2];
 	double gap;    /* radians from a view to the next, in the mean */
+	double least;  /* squares: what is usual is no less, */
+	double faint;  /* and what is off by no more than this is little beside what views show */
 	int *views;    /* [count], of the places in the order that was found so far */
 	double *apart; /* [count], of a place from the next, mean squares */
 	double *usual; /* [count] */
@@ -26,7 +28,8 @@ struct search {
 
 /* How far a view is off another one, a squared mean. */
 double misplaced_apart(const struct search *search, int a, int b);
-/* What a third of the values about each place do not exceed, itself excepted. values: [count]. */
+/* What a third of the values about each place do not exceed, itself excepted, and no less than what rounding makes.
+ * values: [count], squares. */
 void misplaced_usual(const struct search *search, const double *values, double *ret);
 /* Puts the views in order, as far as one is found. */
 void misplaced_order(const struct search *search);

@@ -289,7 +289,8 @@ void misplaced_order(const struct search *search)
 					     fmax(1, pow(ring_turn(search->ring, i, (i + 1) % count) / search->gap, 2));
 	misplaced_usual(search, search->apart, search->usual);
 	for (int i = 0; i < count; i++)
-		cut = cut || (!is_fixed(search->ring, i) && is_cut(search, i, CUT));
+		cut = cut ||
+		      (!is_fixed(search->ring, i) && search->apart[i] > CUT * fmax(search->usual[i], search->faint));
 	for (int tries = 0; tries < TRIES && cut && size > SMALLEST_CUT; tries++) {
 		if (find_order_of(search, size) > 0)
 			return;

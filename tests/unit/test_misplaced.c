@@ -150,6 +150,70 @@ START_TEST(the_end_of_a_board_that_leaves_the_detector_misplaces_no_view)
 }
 END_TEST
 
+enum { CUT_PARTS = 3 };
+#define CYLINDER(a, b, half, z, turn, rho)                                                                             \
+	{                                                                                                              \
+		.shape = SHAPE_CYLINDER, .semi_axes = {a, b, half}, .centre = {0, 0, z}, .angle = turn, .density = rho \
+	}
+#define CAP(z) CYLINDER(13, 12, .5, z, 0, .0154)
+static const struct {
+	int columns, rows, views;
+	double pixel[2], first, step; /* mm, degrees */
+	int rounded[2];               /* views that are one bit off */
+	int count;
+	struct ellipsoid parts[CUT_PARTS];
+} smooth[] = {
+    /* Wider than the detector, with flat ends within the rows; narrow, of an arc, and of a turn. */
+    {48, 60, 72, {1.6, 1.6}, 49, 5, {0}, 1, {CYLINDER(26, 24, 13, 0, 0, .0192)}},
+    {32, 24, 60, {2.4, 2.4}, 49, 200. / 59, {0}, 1, {CYLINDER(14, 13, 30, 0, 0, .0192)}},
+    {32, 24, 60, {2.25, 2.5}, 20, 6, {0}, 1, {CYLINDER(18, 15.5, 8, 0, 0, .0192)}},
+    /* Flat ends with a thin cap. */
+    {32, 24, 100, {2, 56. / 24}, 49, 3.6, {0}, 3, {CYLINDER(13, 12, 11, 0, 0, .0192), CAP(10.5), CAP(-10.5)}},
+    {48, 32, 72, {64. / 48, 1.75}, 0, 5, {0}, 3, {CYLINDER(13, 12, 11, 0, 0, .0192), CAP(10.5), CAP(-10.5)}},
+    /* All but round, and the same from many sides; round but for rounding. */
+    {58,
+     45,
+     95,
+     {1.31, 1.067},
+     294.3,
+     360. / 95,
+     {0},
+     2,
+     {CYLINDER(26.41, 26.05, 8.55, 0, 1.52, .0192), CYLINDER(13.2, 10.56, 6, 0, .729, .0096)}},
+    {32, 24, 60, {2.4, 2.4}, 0, 6, {20, 40}, 1, {CYLINDER(14, 14, 12, 0, 0, .0192)}},
+};
+
+/* Without noise, what is usual from view to view is next to nothing where a smooth body shows its broad side. */
+START_TEST(a_smooth_body_without_noise_misplaces_no_view)
+{
+	const struct orbit_spec spec = {
+	    smooth[_i].columns, smooth[_i].rows,
+	    smooth[_i].views,   {600, 1000, {smooth[_i].pixel[0], smooth[_i].pixel[1]}, {0, 0}, {0, 0}},
+	    smooth[_i].first,   smooth[_i].step};
+	struct ellipsoid parts[CUT_PARTS];
+	const struct phantom phantom = {.count = smooth[_i].count, .parts = parts};
+	const struct grid grid = grid_of(12, 12, 6, 4, 4, 4);
+	struct recipe recipe = recipe_on(&grid);
+	struct outcome outcome = {0};
+	struct scene scene;
+
+	memcpy(parts, smooth[_i].parts, sizeof(parts));
+	recipe.fdk.on = true;
+	scene_orbit(&scene, &spec);
+	scene_add(&scene, &phantom);
+	for (int k = 0; k < 2 && smooth[_i].rounded[1] > 0; k++)
+		for (int i = 0; i < spec.columns * spec.rows; i++) {
+			float *p = &scene.projections[smooth[_i].rounded[k] * spec.columns * spec.rows + i];
+
+			*p = nextafterf(*p, 1);
+		}
+	run(&scene, &recipe, &outcome);
+	ck_assert_msg(strstr(outcome.warnings, "misplaced_views") == NULL, "row %d: %s", _i, outcome.warnings);
+	outcome_clear(&outcome);
+	scene_clear(&scene);
+}
+END_TEST
+
 /*
  * A tube that gives less and less: where a full turn closes, the first view and the last one stand beside each other. A
  * rod looks alike from many sides.
@@ -196,6 +260,7 @@ Suite *misplaced_suite(void)
 	tcase_add_loop_test(tests, exchanged_views_are_put_in_their_places, 0, ROWS_OF_TEST);
 	tcase_add_loop_test(tests, the_end_of_a_board_that_leaves_the_detector_misplaces_no_view, 0,
 			    sizeof(tables) / sizeof(*tables));
+	tcase_add_loop_test(tests, a_smooth_body_without_noise_misplaces_no_view, 0, sizeof(smooth) / sizeof(*smooth));
 	tcase_add_loop_test(tests, a_tube_whose_output_falls_misplaces_no_view, 0, 2);
 	suite_add_tcase(suite, tests);
 	return suite;
