@@ -98,7 +98,7 @@ static struct exterior_rows subtract_row(const struct projection *of, int row)
 	double *smooth = of->smooth + at, outside = 0;
 	struct exterior_rows found = {0};
 
-	if (of->steps & (EXTERIOR_BEYOND | EXTERIOR_WITHIN) && row >= of->seen->first && row <= of->seen->last)
+	if (of->steps & EXTERIOR_BEYOND && row >= of->seen->first && row <= of->seen->last)
 		found.truncated = 1;
 	else if (of->steps & EXTERIOR_BEYOND)
 		found.truncated = is_truncated(&of->known, row, measured, of->columns, of->largest, of->air);
@@ -117,6 +117,33 @@ static struct exterior_rows subtract_row(const struct projection *of, int row)
 	if (outside > 0 && outside >= (double)truncation_level_of_many(of->largest) * of->columns)
 		found.outside = 1;
 	return found;
+}
+
+/* Step 3 of exterior.h. reach: rows to either side; 0 where all of the smooth difference is taken. */
+static void hold_view(const struct projection *of, int reach, struct exterior_rows *rows)
+{
+	const int first = of->seen->first > 0 ? of->seen->first : 0;
+	const int last = of->seen->last < of->rows - 1 ? of->seen->last : of->rows - 1;
+	const ptrdiff_t columns = of->columns;
+
+#pragma omp parallel for schedule(static)
+	for (int r = first; r <= last; r++)
+		smooth_row(of->measured + r * columns, of->explained + r * columns, of->smooth + r * columns,
+			   of->columns);
+#pragma omp parallel for schedule(static)
+	for (int r = first; r <= last; r++) {
+		const int from = r - reach > first ? r - reach : first, to = r + reach < last ? r + reach : last;
+
+		for (ptrdiff_t c = 0; c < columns; c++) {
+			double taken = of->smooth[r * columns + c], sum = 0;
+
+			for (int k = from; k <= to && reach > 0; k++)
+				sum += of->smooth[k * columns + c];
+			taken -= sum / (to - from + 1);
+			of->measured[r * columns + c] = (float)((double)of->measured[r * columns + c] - taken);
+		}
+	}
+	rows->truncated += (size_t)(last - first + 1);
 }
 
 static void subtract_view(const struct projection *of, struct exterior_rows *rows)
@@ -279,7 +306,10 @@ int exterior_subtract(const struct exterior_volume *exterior, const struct exter
 			    .smooth = smooth,
 			};
 
-			subtract_view(&projection, &found);
+			if (within)
+				hold_view(&projection, exterior->reach, &found);
+			else
+				subtract_view(&projection, &found);
 		}
 		if (code == 0)
 			code = backend->stack_upload(options->projections, first, count, measured, err);

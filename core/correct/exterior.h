@@ -28,13 +28,14 @@ struct correction_job;
  *    far from the truth as FDK's, with slices of w as thin as memory goes (EXTERIOR_SLICES_OF_A_ROW). So once nothing
  *    else changes the projections, p'' - smooth(p'' - A f) in the same rows. f is FDK's volume on the recipe's own
  *    grid, of the projections before step 1, with w where not all views see a place. Then the means over many columns
- *    are f's, whatever w lacks. Not of an arc that lacks some degrees, nor with what is very dense: FDK's means are
- *    wrong by that, too, and iterations make better ones.
+ *    are f's, whatever w lacks. Of an arc that lacks some degrees, and where something very dense is in the scan, FDK's
+ *    means are wrong by that, too, and iterations make better ones: there of smooth only what differs from its mean
+ *    over EXTERIOR_REACH slices of w to either side goes, which has a body's end and little of such errors.
  *
  * Where the first two are there, step 2 goes first, with the start of w: its fit to the projections would otherwise put
  * what lies beyond the field of view into it.
  */
-enum { EXTERIOR_PART = 32 };
+enum { EXTERIOR_PART = 32, EXTERIOR_REACH = 8 };
 /*
  * Iterations of ten updates after which they settle (core/correct/averaging.h) in a scan with truncated rows: what the
  * coarse volume cannot hold of the exterior stays in the projections, and each iteration puts more of it into the grid.
@@ -65,10 +66,12 @@ int exterior_look(const struct exterior_volume_options *options, struct exterior
 
 /*
  * f of step 3, on the host, with the rows that it is of: FDK of the projections as they are, on options->plan, through
- * `fdk` with nothing pending. `work` is a volume on the recipe's grid to work in. Freed with exterior_volume_clear.
+ * `fdk` with nothing pending. whole: f's means are held to all over. `work` is a volume on the recipe's grid to work
+ * in. Freed with exterior_volume_clear.
  */
 int exterior_within_make(struct exterior_volume *exterior, const struct exterior_volume_options *options,
-			 const struct exterior_rows *seen, struct fdk *fdk, struct volume *work, struct error *err);
+			 const struct exterior_rows *seen, bool whole, struct fdk *fdk, struct volume *work,
+			 struct error *err);
 /* Puts w where not all views see a place, before exterior_volume_leave_device. */
 int exterior_within_fill(struct exterior_volume *exterior, const struct grid *grid, struct error *err);
 

@@ -32,12 +32,6 @@ static bool wanted(const struct recipe *recipe, const struct linearise *linearis
 	return recipe->algorithm != NULL;
 }
 
-/* An arc that lacks some degrees is in FDK's means over many columns as well. */
-static bool fdk_is_whole(const struct orbit *orbit)
-{
-	return orbit_fdk_is_sound(orbit) && !orbit->arc_too_short;
-}
-
 static int bytes_of(const struct correction_ask *ask, struct correction_bytes *bytes, struct error *err)
 {
 	const struct exterior_volume_options options = {.backend = ask->backend,
@@ -53,7 +47,7 @@ static int bytes_of(const struct correction_ask *ask, struct correction_bytes *b
 	bytes->device += own.device;
 	bytes->borrowed += own.borrowed;
 	bytes->host += own.host;
-	if (ask->recipe->fdk.on && fdk_is_whole(ask->orbit))
+	if (ask->recipe->fdk.on && orbit_fdk_is_sound(ask->orbit))
 		bytes->aside += grid_voxels(&ask->recipe->grid) * sizeof(float);
 	return 0;
 }
@@ -68,9 +62,10 @@ static int subtract(const struct correction_job *job, const struct exterior_volu
 	struct exterior_rows rows = {0};
 	int steps = EXTERIOR_OUTSIDE | (recipe->fdk.extend ? EXTERIOR_BEYOND : 0), code = 0;
 
-	/* And so are streaks of what is very dense. */
-	if (seen->truncated > 0 && recipe->fdk.on && fdk_is_whole(job->orbit) && job->dense->traces_count == 0)
-		code = exterior_within_make(exterior, options, seen, job->fdk, job->work, err);
+	if (seen->truncated > 0 && recipe->fdk.on && !options->poor)
+		code = exterior_within_make(exterior, options, seen,
+					    !job->orbit->arc_too_short && job->dense->traces_count == 0, job->fdk,
+					    job->work, err);
 	if (code == 0 && exterior->goes_on && seen->truncated > 0 && !options->poor) {
 		code = exterior_subtract(exterior, options, EXTERIOR_BEYOND, seen, job->work, &rows, err);
 		steps = EXTERIOR_OUTSIDE;

@@ -84,6 +84,7 @@ struct exterior_volume {
 	bool goes_on;        /* something is left outside of the recipe's grid */
 	float *within;       /* exterior_within_make's (exterior.h), on the recipe's grid, owned; NULL without */
 	int rows[2];         /* it is of these rows of the projections, the first and the last one */
+	int reach;           /* rows to either side whose mean is not held to it; 0: all is */
 };
 
 /*

@@ -1,11 +1,13 @@
 /* The object within the grid as FDK has it, of a scan whose rows are truncated: see exterior.h. */
+#include <math.h>
 #include <stdlib.h>
 
 #include "core/correct/correction.h"
 #include "core/correct/exterior.h"
 
 int exterior_within_make(struct exterior_volume *exterior, const struct exterior_volume_options *options,
-			 const struct exterior_rows *seen, struct fdk *fdk, struct volume *work, struct error *err)
+			 const struct exterior_rows *seen, bool whole, struct fdk *fdk, struct volume *work,
+			 struct error *err)
 {
 	const struct backend *backend = options->backend;
 	const struct grid *grid = options->grid;
@@ -35,6 +37,8 @@ int exterior_within_make(struct exterior_volume *exterior, const struct exterior
 		exterior->within = within;
 	exterior->rows[0] = seen->first;
 	exterior->rows[1] = seen->last;
+	exterior->reach =
+	    whole ? 0 : (int)ceil(EXTERIOR_REACH * exterior->grid.spacing[2] / options->orbit->pixel_at_isocentre[1]);
 	return code;
 }
 
