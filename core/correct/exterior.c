@@ -22,6 +22,7 @@ struct ends_known {
 struct projection {
 	int steps;
 	const struct exterior_rows *seen;
+	bool between; /* rows between those of seen count as truncated */
 	const struct view *view;
 	int columns, rows;
 	struct ends_known known;
@@ -98,7 +99,7 @@ static struct exterior_rows subtract_row(const struct projection *of, int row)
 	double *smooth = of->smooth + at, outside = 0;
 	struct exterior_rows found = {0};
 
-	if (of->steps & EXTERIOR_BEYOND && row >= of->seen->first && row <= of->seen->last)
+	if (of->steps & EXTERIOR_BEYOND && of->between && row >= of->seen->first && row <= of->seen->last)
 		found.truncated = 1;
 	else if (of->steps & EXTERIOR_BEYOND)
 		found.truncated = is_truncated(&of->known, row, measured, of->columns, of->largest, of->air);
@@ -292,6 +293,7 @@ int exterior_subtract(const struct exterior_volume *exterior, const struct exter
 			const struct projection projection = {
 			    .steps = steps,
 			    .seen = seen,
+			    .between = options->truncated,
 			    .view = &geometry->views[first + i],
 			    .columns = geometry->columns,
 			    .rows = geometry->rows,

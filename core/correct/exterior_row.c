@@ -82,8 +82,11 @@ static int subtract(const struct correction_job *job, const struct exterior_volu
 	}
 	code = exterior_subtract(exterior, options, steps, seen, job->work, &rows, err);
 	*ret_taken = exterior->goes_on;
+	/* What the model has beside the field of view, and where not all views see, may all be in the grid. */
+	if (code == 0 && !exterior->goes_on && options->truncated)
+		code = exterior_volume_sample(exterior, options->grid, job->work, err);
 	/* Iterations without FDK start from zero. */
-	if (code == 0 && exterior->goes_on && recipe->fdk.on && *job->iteration == 0)
+	if (code == 0 && (exterior->goes_on || options->truncated) && recipe->fdk.on && *job->iteration == 0)
 		code = exterior_start(exterior, options, job->work, job->volume, err);
 	if (code == 0 && exterior->within != NULL)
 		code = exterior_within_fill(exterior, options->grid, err);
@@ -167,14 +170,10 @@ static int look(const struct correction_job *job, struct exterior_volume_options
 	options->fine_slices = seen.truncated > 0 && sound;
 	/*
 	 * An object may end inside of the grid: FDK's blur beyond its faces is none of the object. One that truncates
-	 * rows up to both ends goes on beside a grid that ends with the field of view, though no ray that is seen
-	 * leaves that.
+	 * rows up to both ends goes on beyond them, though no ray that is seen may leave the grid.
 	 */
-	options->inside_only = seen.outside == 0 && !seen.possible &&
-			       !(options->truncated && seen.to_ends && ends_with_view(options->grid, options->orbit));
+	options->inside_only = seen.outside == 0 && !seen.possible && !(options->truncated && seen.to_ends);
 	options->truncated = options->truncated && !options->inside_only;
-	if (!options->truncated)
-		seen.last = -1;
 	*ret_seen = seen;
 	return 0;
 }
