@@ -63,8 +63,9 @@ struct correction_job {
 	double *settled;                   /* iterations after which relaxation falls (averaging.h); INFINITY: never */
 	struct metal *dense;               /* what is very dense, and its traces (dense.h); the chain's own */
 	/*
-	 * The model by which matter outside of the grid was taken out of the projections, on the host alone, until they
-	 * are averaged; where it does not go on nothing was taken. The chain's own.
+	 * The model by which matter outside of the grid was taken out of the projections, on the host alone, until
+	 * truncated rows are held to FDK's means (exterior.h, step 3); where it does not go on nothing was taken. The
+	 * chain's own.
 	 */
 	struct exterior_volume *exterior;
 	const struct warning_sink *warnings;

@@ -894,9 +894,8 @@ static double mean_of_slice(const struct grid *grid, double radius, const float 
 /*
  * The same body where it ends within the rows, flat, between slices or amid one: FDK blurs the end over a row, by up to
  * 300 HU in the slice on either side, and the iterations' slices are off by what FDK's are. They were off by up to 33
- * HU more on rows as high as slices, and by up to 20 on finer
- * ones, with an arc that lacks some degrees as well, and by 35 where both ends lie within a grid wider than the field
- * of view.
+ * HU more on rows as high as slices, by up to 20 on finer ones, with an arc that lacks some degrees as well, and by 35
+ * where both ends lie within a grid wider than the field of view.
  */
 START_TEST(a_body_wider_than_the_detector_that_ends_within_the_rows_ends_as_in_fdk)
 {
