@@ -50,7 +50,11 @@ struct exterior_rows {
 	int first, last; /* exterior_look only */
 	bool to_ends;    /* the outermost rows at both ends are, in some view; exterior_look only */
 	size_t beside;   /* of `outside`, those with rays that miss the grid and are not air; exterior_look only */
-	size_t certain;  /* rows looked at that count something outside, whatever noise may be; exterior_look only */
+	/*
+	 * Rows looked at that count something outside, whatever noise may be. Where there are none, and none is
+	 * truncated, the fit decides whether anything is taken out. exterior_look only.
+	 */
+	size_t certain;
 	/*
 	 * No row counts anything outside, but that cannot be excluded, for the rays through what may be there pass the
 	 * grid as well: the end of a body some mm beyond the grid's. exterior_look only.

@@ -72,8 +72,9 @@ static int subtract(const struct correction_job *job, const struct exterior_volu
 	}
 	if (code == 0 && exterior->goes_on)
 		code = exterior_volume_fit(exterior, options, err);
-	/* An exterior that was only possible is left alone where the fit does not find it. */
-	if (code == 0 && seen->possible && seen->truncated == 0 &&
+	/* Of few photons rows count one by chance. What is only possible is left alone where the fit does not find it.
+	 */
+	if (code == 0 && seen->certain == 0 && seen->truncated == 0 &&
 	    !(exterior->goes_on && exterior_volume_has_outside(exterior, options->grid)))
 		steps = 0;
 	if (code < 0 || steps == 0) {
@@ -253,7 +254,9 @@ static int apply(const struct correction_job *job, void *state, enum correction_
 		*job->settled = fmin(*job->settled, EXTERIOR_SETTLED);
 	if (rows.outside + rows.truncated > 0)
 		*job->outside = true;
-	/* Of few photons some rows are taken for such by chance, and what is taken out of them is noise. */
+	/* Beside truncated rows others are taken for such by chance, of few photons, and what is taken out of them is
+	 * noise.
+	 */
 	if (code == 0 && (seen.certain > 0 || exterior_volume_has_outside(exterior, options.grid)))
 		warn_of_outside(job, rows.outside);
 	if (code == 0 && (taken || exterior->within != NULL))
