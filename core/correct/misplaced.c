@@ -13,6 +13,8 @@ enum { AROUND = 10, USUAL_LEAST = 4, VIEWS_LEAST = 24, PIXELS_LEAST = 16, SINGLE
 static const double OFF = 6, FITS = 3;
 static const double BETTER = 4; /* times a single view fits better elsewhere */
 static const double SURE = 2;   /* times as much where no other one's place is free for it */
+/* Times that each of two views that were exchanged fits better at the other one's place, and that it plainly does. */
+static const double PARTNER = 3, PLAIN = 10;
 /*
  * Of what views show: what is usual is no less than the first, or rounding is unusual where an object is round and
  * there is no noise. What is off by less than the second, squares OFF times as much, is faint: below one HU of the
@@ -337,6 +339,55 @@ static int from_for(const struct search *search, int place)
 	return from;
 }
 
+/* How far a view lies off at a place while another one is out. */
+static double off_without(const struct search *search, int view, int place, int without)
+{
+	const bool out = search->out[without];
+	double off;
+
+	search->out[without] = true;
+	off = off_at(search, view, place, beside(search, place, -1), beside(search, place, 1), NOTHING);
+	search->out[without] = out;
+	return off;
+}
+
+/* How many times less a view lies off at a place than the one that is stored there, each while its own place is out; 0:
+ * it does not fit. */
+static double fits_better(const struct search *search, int from, int place)
+{
+	const double now = off_without(search, search->views[place], place, from);
+	const double off = off_without(search, search->views[from], place, from);
+
+	return isfinite(now) && off <= fmax(OFF * search->usual[place], now / PLAIN) ? now / off : 0;
+}
+
+/* Of two views that were exchanged one may be found alone, as neighbours are: puts both where they fit much better. */
+static void find_partners(const struct search *search)
+{
+	for (int i = 0; i < search->ring->count; i++) {
+		const int view = search->views[i];
+		double best = PARTNER;
+		int partner = -1;
+
+		if (!search->out[i] || from_for(search, i) >= 0)
+			continue;
+		for (int k = 0; k < search->ring->count; k++) {
+			const double better =
+			    search->out[k] ? 0 : fmin(fits_better(search, i, k), fits_better(search, k, i));
+
+			if (better >= best) {
+				best = better;
+				partner = k;
+			}
+		}
+		if (partner < 0)
+			continue;
+		search->out[i] = false;
+		search->views[i] = search->views[partner];
+		search->views[partner] = view;
+	}
+}
+
 static int mark(const struct search *search, struct step *ret_steps)
 {
 	const struct ring *ring = search->ring;
@@ -349,7 +400,10 @@ static int mark(const struct search *search, struct step *ret_steps)
 		if (search->out[i]) {
 			const int other = from_for(search, i);
 
-			from = other < 0 ? -1 : search->views[other];
+			/* No view is at two places: another one fits into its own, too, or it is left out. */
+			from = other < 0 || !(search->sure[other] || from_for(search, other) >= 0)
+				   ? -1
+				   : search->views[other];
 			/* A view that fits into two places fits into none. */
 			for (int k = 0; k < ring->count && other >= 0; k++)
 				if (k != i && search->out[k] && from_for(search, k) == other)
@@ -413,6 +467,7 @@ static int find(const struct ring *ring, const struct view_strips *strips, const
 		search.faint = pow(FAINT * shown, 2);
 		misplaced_order(&search);
 		find_singles(&search);
+		find_partners(&search);
 		found = mark(&search, ret_steps);
 	}
 	free(search.views);

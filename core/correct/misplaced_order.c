@@ -11,6 +11,9 @@ static const double CUT = 5, SMALLEST_CUT = 1.5, JOINS = 3;
  */
 static const double PLAIN = 10, ALONE = 3;
 enum { FLANK = 4 };
+static const double BETTER = 1.3; /* times, squares: the least of the cuts that an order mends, beside its worst join */
+static const double LIKE = 1.5;   /* times, squares, that a step is no more than others */
+enum { RUN_LEAST = 4 };           /* in fewer views turning them about is exchanging the first and the last one */
 enum { TRIES = 16 };
 enum { MOST = 2 }; /* one view in so many */
 
@@ -102,6 +105,66 @@ static bool join(const struct search *search, const struct piece *pieces, int co
 	return true;
 }
 
+/* How far the view at a place is off that at another one; places before the first one and behind the last one, too. */
+static double step_between(const struct search *search, int a, int b)
+{
+	const int all = search->ring->count;
+
+	return misplaced_apart(search, search->views[(a + all) % all], search->views[(b + all) % all]);
+}
+
+/* A step beside those before and behind it, between places in the order that is stored. */
+static double beside_its_neighbours(const struct search *search, int before, int behind)
+{
+	return step_between(search, before, behind) /
+	       sqrt(step_between(search, before - 1, before) * step_between(search, behind, behind + 1));
+}
+
+/*
+ * A single view fits where another one was taken, too, if an object looks the same from two sides: it need not have
+ * been taken between the two views that it fits. If it was, it left a step of two there, and none where it is stored;
+ * else it is the other way round.
+ */
+static bool was_taken_between(const struct search *search, int place, int before, int behind)
+{
+	return beside_its_neighbours(search, before, behind) > beside_its_neighbours(search, place - 1, place + 1);
+}
+
+/* Puts pieces of one view back that were not taken where they fit. */
+static void leave_single_ones(const struct search *search, const struct piece *pieces, int count, int *before)
+{
+	for (int p = 0; p < count; p++) {
+		const int own = (p + count - 1) % count, next = (p + 1) % count, behind = (before[p] + 1) % count;
+
+		if (pieces[p].end - pieces[p].first > 1 || before[p] == own || before[next] != own ||
+		    before[behind] != p ||
+		    was_taken_between(search, pieces[p].first, pieces[before[p]].end - 1, pieces[behind].first))
+			continue;
+		before[behind] = before[p];
+		before[p] = own;
+		before[next] = p;
+	}
+}
+
+/* True if one at least of the cuts that an order mends is plain, and all are larger than what is left where it joins
+ * pieces. */
+static bool is_better(const struct search *search, const struct piece *pieces, int count, const int *before)
+{
+	double smallest = INFINITY, largest = 0, joined = 0;
+
+	for (int p = 0; p < count; p++) {
+		const int own = (p + count - 1) % count, place = (pieces[own].end - 1) % search->ring->count;
+		const double cut = search->apart[place] / search->usual[place];
+
+		if (before[p] == own)
+			continue;
+		smallest = fmin(smallest, cut);
+		largest = fmax(largest, cut);
+		joined = fmax(joined, cost_of(search, pieces, count, before[p], p));
+	}
+	return largest > CUT && smallest >= BETTER * joined;
+}
+
 /* Puts the pieces one behind the other, from the longest on; returns how many views are elsewhere then. */
 static int put_in_order(const struct search *search, const struct piece *pieces, int count, const int *before,
 			int *ret_views)
@@ -146,13 +209,38 @@ static void turn_about(const struct search *search, int first, int end)
 	}
 }
 
+/* True if the step over the view at a place is like the larger one of those before and behind it, of two as well. */
+static bool is_step_of_two(const struct search *search, int place)
+{
+	return step_between(search, place - 1, place + 1) <=
+	       LIKE * fmax(step_between(search, place - 3, place - 1), step_between(search, place + 1, place + 3));
+}
+
+/* True if what cuts the ring behind a place may be one of the two views there alone. */
+static bool is_cut_by_one(const struct search *search, int place)
+{
+	return is_fixed(search->ring, place) || is_step_of_two(search, place) || is_step_of_two(search, place + 1);
+}
+
+/*
+ * True if the views behind a place up to another one need not be stored backwards although both sides are cut and are
+ * not when they are turned about: each cut is mended as well by leaving one view out. So it is where single views of an
+ * object that looks the same from two sides stand at the places of their twins.
+ */
+static bool may_be_single_ones(const struct search *search, int before, int last)
+{
+	return is_cut_by_one(search, before) && is_cut_by_one(search, last);
+}
+
 /* True if a piece joins what lies on both sides when it is turned about. */
 static bool is_backward(const struct search *search, const struct piece *piece)
 {
 	const int all = search->ring->count;
 	const int first = piece->first % all, last = (piece->end - 1) % all, before = (first + all - 1) % all;
+	const int length = piece->end - piece->first;
 
-	return piece->end - piece->first > 1 && !is_fixed(search->ring, before) && !is_fixed(search->ring, last) &&
+	return length > 1 && !(length >= RUN_LEAST && may_be_single_ones(search, before, last)) &&
+	       !is_fixed(search->ring, before) && !is_fixed(search->ring, last) &&
 	       joins(search, before, last, before) && joins(search, first, (last + 1) % all, last);
 }
 
@@ -191,6 +279,9 @@ static int find_order_of(const struct search *search, double cut)
 
 	if (pieces_count < 3 || !join(search, pieces, pieces_count, search->costs, before))
 		return turn_backward_ones(search, pieces, pieces_count);
+	leave_single_ones(search, pieces, pieces_count, before);
+	if (!is_better(search, pieces, pieces_count, before))
+		return turn_backward_ones(search, pieces, pieces_count);
 	moved = put_in_order(search, pieces, pieces_count, before, search->work);
 	if (moved == 0)
 		return turn_backward_ones(search, pieces, pieces_count);
@@ -212,18 +303,19 @@ static double next_cut(const struct search *search, double cut)
 	return next * (1 - 1e-9);
 }
 
-/* The cut from a place to the next one where it is plain, and what is left of it with two other views there; false: it
- * is no such cut. Where a gap in the scan follows it there is none. */
+/* The cut from a place to the next one where it is plain, and little is left of it with two other views there; false:
+ * it is no such cut. Where a gap in the scan follows it there is none. */
 static bool is_plain(const struct search *search, int place, int before, int behind, double *ret_cut)
 {
 	const double cut = search->apart[place];
+	double left;
 
 	*ret_cut = INFINITY;
 	if (is_fixed(search->ring, place))
 		return true;
 	*ret_cut = cut;
-	return cut > CUT * search->usual[place] &&
-	       PLAIN * misplaced_apart(search, search->views[before], search->views[behind]) <= cut;
+	left = step_between(search, before, behind);
+	return cut > CUT * search->usual[place] && PLAIN * left <= cut && left <= PLAIN * search->usual[place];
 }
 
 /* True if the ring has no gap and no cut at a place that is one beside that. */
@@ -237,18 +329,25 @@ static bool is_quiet(const struct search *search, int place, double cut)
 /*
  * True if the views behind a place up to another one were stored backwards: both sides are plainly cut, all but nothing
  * of that is left when they are turned about, and nothing else in them and near by is cut like that, as where something
- * comes and goes, or where runs are exchanged. At an end of the scan there is one side.
+ * comes and goes, or where runs are exchanged. At an end of the scan there is one side, and nothing else may be cut
+ * like that in all of it.
  */
 static bool is_backward_run(const struct search *search, int before, int last)
 {
 	const int all = search->ring->count, first = (before + 1) % all, behind = (last + 1) % all;
 	const int length = (last - before + all) % all;
+	const bool at_an_end = is_fixed(search->ring, before) || is_fixed(search->ring, last);
 	double cuts[2], least;
 
 	if (length < 2 || MOST * length > all || (is_fixed(search->ring, before) && is_fixed(search->ring, last)) ||
 	    !is_plain(search, before, before, last, &cuts[0]) || !is_plain(search, last, first, behind, &cuts[1]))
 		return false;
+	if (length >= RUN_LEAST && may_be_single_ones(search, before, last))
+		return false;
 	least = fmin(cuts[0], cuts[1]);
+	for (int k = 0; k < all && at_an_end; k++)
+		if (k != before && k != last && !is_fixed(search->ring, k) && !is_quiet(search, k, least))
+			return false;
 	for (int k = 1; k < length; k++)
 		if (!is_quiet(search, before + k, least))
 			return false;

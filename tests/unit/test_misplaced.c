@@ -19,6 +19,7 @@ static const struct {
 	int mended, left_out;
 	double plate;    /* 1/mm, seen from its edge in two views */
 	int backward[2]; /* so many views from the second on come last first */
+	bool box;        /* a box alone, which looks the same from two sides */
 } rows[] = {
     {.exchanged = {{1, 7, 30}}, .step = 6, .mended = 2},
     {.exchanged = {{1, 7, 11}, {1, 20, 52}, {1, 25, 45}}, .step = 6, .mended = 6},
@@ -36,18 +37,27 @@ static const struct {
     {.backward = {9, 51}, .step = 3.5, .mended = 8},
     {.backward = {9, 10}, .step = 6, .mended = 8, .plate = .05}, /* the object cuts the ring, too */
     {.backward = {12, 40}, .step = 6, .mended = 12, .plate = .05},
+    {.exchanged = {{1, 30, 31}}, .step = 3.5, .mended = 2},
+    {.backward = {8, 20}, .step = 6, .mended = 8, .box = true},
+    {.exchanged = {{1, 12, 45}}, .step = 6, .mended = 2, .box = true},
+    {.exchanged = {{1, 9, 12}}, .step = 3.5, .mended = 2, .box = true},
+    {.exchanged = {{5, 8, 30}}, .step = 6, .mended = 10, .box = true},
+    {.off = {17, 19}, .step = 6, .left_out = 1, .box = true},
+    {.off = {45, 47}, .step = 3.5, .left_out = 1, .box = true},
 };
 enum { ROWS_OF_TEST = sizeof(rows) / sizeof(rows[0]) };
 
-static void add_body(struct scene *scene, double plate)
+static void add_body(struct scene *scene, int row)
 {
+	const double plate = rows[row].plate;
+	struct ellipsoid box = {.shape = SHAPE_BOX, .semi_axes = {30, 18, 22}, .density = .0192};
 	struct ellipsoid parts[] = {
 	    {.shape = SHAPE_ELLIPSOID, .semi_axes = {38, 32, 28}, .centre = {2, -3, 1}, .density = 0.02},
 	    {.shape = SHAPE_ELLIPSOID, .semi_axes = {9, 8, 12}, .centre = {14, 6, 4}, .density = 0.02},
 	    {.shape = SHAPE_ELLIPSOID, .semi_axes = {4, 7, 9}, .centre = {-16, -12, -6}, .density = -0.018},
 	    {.shape = SHAPE_BOX, .semi_axes = {30, .5, 24}, .centre = {0, 12, 0}, .density = plate},
 	};
-	const struct phantom phantom = {.count = plate > 0 ? 4 : 3, .parts = parts};
+	const struct phantom phantom = {rows[row].box ? 1 : plate > 0 ? 4 : 3, rows[row].box ? &box : parts};
 
 	scene_add(scene, &phantom);
 }
@@ -80,7 +90,7 @@ static void spoil(struct scene *scene, int row)
 		struct scene other;
 
 		scene_orbit(&other, &spec);
-		add_body(&other, rows[row].plate);
+		add_body(&other, row);
 		memcpy(scene->projections + rows[row].off[0] * PIXELS, other.projections,
 		       PIXELS * sizeof(*other.projections));
 		scene_clear(&other);
@@ -103,7 +113,7 @@ START_TEST(exchanged_views_are_put_in_their_places)
 	recipe.algorithm = &algorithm_sart;
 	recipe.iterate.iterations = 2;
 	scene_orbit(&scene, &spec);
-	add_body(&scene, rows[_i].plate);
+	add_body(&scene, _i);
 	run(&scene, &recipe, &good);
 	ck_assert_msg(strstr(good.warnings, "misplaced_views") == NULL, "%s", good.warnings);
 	spoil(&scene, _i);
