@@ -32,8 +32,8 @@ if [ "${1:-}" = --soak ]; then
 else
 	JOBS=${JOBS:-$((5 * processors))}
 	export CK_EXCLUDE_TAGS=long
-	parts=(unit/recon unit/study unit/exterior unit/outofcore unit/metal unit/algorithm unit/stuck unit/detector unit/noise
-		unit/backend)
+	parts=(unit/recon unit/study unit/exterior unit/calibrate unit/detector unit/refine unit/metal unit/outofcore
+		unit/calibrate_views unit/noise unit/algorithm unit/stuck unit/averaging unit/backend)
 	begin_with=(fleet restart devices_of_a_job page real postgresql phantom refine scatter fleet_network supervise
 		arriving metal job damage dimse send dicom demo faulty_device empty_views patient rings import events memory)
 	rest=$("$BUILD/unit" --list | sed 's,^,unit/,') || exit 1
