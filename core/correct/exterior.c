@@ -272,8 +272,10 @@ int exterior_subtract(const struct exterior_volume *exterior, const struct exter
 				 geometry->columns, geometry->rows);
 	if (code == 0 && !within)
 		code = faces_make(&faces, backend, exterior->volume, &exterior->grid, err);
+	/* Beside truncated rows w's slices are finer by far, and FDK's means are held to in the end. */
 	if (code == 0 && inside != NULL)
-		code = exterior_volume_sample(exterior, options->grid, work, err);
+		code = options->fine_slices ? exterior_volume_sample(exterior, options->grid, work, err)
+					    : exterior_volume_means(exterior, options->grid, work, err);
 	if (code == 0)
 		code = backend->stack_new(options->device, geometry->columns, geometry->rows, slots, &batch, err);
 	/* Several at a time: a pass over the volume costs as much as some views do. */

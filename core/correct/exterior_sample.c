@@ -175,6 +175,162 @@ int exterior_volume_sample(const struct exterior_volume *s, const struct grid *g
 	return code;
 }
 
+/* ---- means over the recipe's voxels ---- */
+
+/* How voxels read w along an axis: `taps` of its values from first[i] on. */
+struct reading {
+	int taps;
+	int *first;    /* [voxels], owned */
+	float *weight; /* [voxels][taps], owned */
+};
+
+static void reading_clear(struct reading *reading)
+{
+	free(reading->first);
+	free(reading->weight);
+}
+
+/* Places of a voxel along an axis, and e, in the square of its width. */
+static int places_of(const struct grid *own, const struct grid *grid, int axis, double *ret_excess)
+{
+	const double part = own->spacing[axis] / grid->spacing[axis];
+	/* A part of a millionth is rounding. */
+	const int places = (int)ceil(1 / part - 1e-6);
+
+	*ret_excess = places > 1 ? part * part / 6 - 1. / (12. * places * places) : 0;
+	return places > 1 ? places : 1;
+}
+
+static double place_within(const struct grid *grid, int axis, int voxel, int place, int places)
+{
+	return grid->origin[axis] + (voxel + (place + 0.5) / places - 0.5) * grid->spacing[axis];
+}
+
+/* Adds w's value at a place to what a voxel reads, by this share. */
+static void weigh_place(const struct grid *own, int axis, double place, float share, int first, float *weight)
+{
+	int at[2];
+	const float part = between(own, axis, place, at);
+
+	weight[at[0] - first] += (1 - part) * share;
+	weight[at[1] - first] += part * share;
+}
+
+/* u of a voxel: R, less what those to both sides have more. */
+static void weigh_voxel(const struct grid *own, const struct grid *grid, int axis, int voxel, struct reading *reading)
+{
+	const bool outermost = voxel == 0 || voxel == grid->size[axis] - 1;
+	const int least = own->size[axis] - reading->taps;
+	float *weight = reading->weight + (size_t)voxel * (size_t)reading->taps;
+	double excess;
+	const int places = places_of(own, grid, axis, &excess), beside = excess > 0;
+
+	if (reading->first[voxel] > least)
+		reading->first[voxel] = least;
+	if (outermost)
+		weigh_place(own, axis, place_within(grid, axis, voxel, 0, 1), 1, reading->first[voxel], weight);
+	for (int k = 0; k < places * (2 * beside + 1) && !outermost; k++) {
+		const int side = k / places - beside;
+
+		weigh_place(own, axis, place_within(grid, axis, voxel + side, k % places, places),
+			    (float)((side == 0 ? 1 + excess : -excess / 2) / places), reading->first[voxel], weight);
+	}
+}
+
+/* Readings of all voxels along an axis. */
+static int read_axis(const struct grid *own, const struct grid *grid, int axis, struct reading *ret, struct error *err)
+{
+	const int voxels = grid->size[axis];
+	double excess;
+	const int places = places_of(own, grid, axis, &excess), beside = excess > 0;
+	int at[2];
+
+	ret->first = malloc((size_t)voxels * sizeof(*ret->first));
+	for (int i = 0; i < voxels && ret->first != NULL; i++) {
+		between(own, axis, place_within(grid, axis, i + beside, places - 1, places), at);
+		ret->first[i] = at[1];
+		between(own, axis, place_within(grid, axis, i - beside, 0, places), at);
+		ret->taps = ret->first[i] - at[0] >= ret->taps ? ret->first[i] - at[0] + 1 : ret->taps;
+		ret->first[i] = at[0];
+	}
+	ret->weight = calloc((size_t)voxels * (size_t)ret->taps, sizeof(*ret->weight));
+	if (ret->first == NULL || ret->weight == NULL)
+		return error_set(err, ERR_NO_MEMORY, "no memory for the weights of %d voxels", voxels);
+	for (int i = 0; i < voxels; i++)
+		weigh_voxel(own, grid, axis, i, ret);
+	return 0;
+}
+
+/* What a slice is worked in: w along z; that along y, too; and the slice. */
+struct means_work {
+	float *plane, *lines, *slice; /* [y][x] of w; [recipe's y][x of w]; [recipe's y][x], owned as one */
+};
+
+/* Sums of `taps` rows, `apart` floats from each other. */
+static void sum_rows(const float *rows, size_t apart, const float *weight, int taps, int columns, float *ret)
+{
+	for (int x = 0; x < columns; x++) {
+		float sum = 0;
+
+		for (int k = 0; k < taps; k++)
+			sum += weight[k] * rows[(size_t)k * apart + (size_t)x];
+		ret[x] = sum;
+	}
+}
+
+static void read_slice(const struct exterior_volume *s, const struct grid *grid, const struct reading axes[3], int z,
+		       const struct means_work *work)
+{
+	const struct reading *along = &axes[0], *across = &axes[1], *up = &axes[2];
+	const int columns = s->grid.size[0], rows = s->grid.size[1];
+	const float *slices = s->voxels + grid_voxel(&s->grid, 0, 0, up->first[z]);
+	const size_t row = (size_t)columns;
+
+#pragma omp parallel for schedule(static)
+	for (int y = 0; y < rows; y++)
+		sum_rows(slices + (size_t)y * row, row * (size_t)rows, up->weight + (size_t)z * (size_t)up->taps,
+			 up->taps, columns, work->plane + (size_t)y * row);
+#pragma omp parallel for schedule(static)
+	for (int y = 0; y < grid->size[1]; y++) {
+		float *line = work->lines + (size_t)y * row;
+
+		sum_rows(work->plane + (size_t)across->first[y] * row, row,
+			 across->weight + (size_t)y * (size_t)across->taps, across->taps, columns, line);
+		for (int x = 0; x < grid->size[0]; x++)
+			sum_rows(line + along->first[x], 1, along->weight + (size_t)x * (size_t)along->taps,
+				 along->taps, 1, work->slice + (size_t)y * (size_t)grid->size[0] + (size_t)x);
+	}
+}
+
+int exterior_volume_means(const struct exterior_volume *s, const struct grid *grid, struct volume *to,
+			  struct error *err)
+{
+	const size_t own = (size_t)s->grid.size[0], rows = (size_t)grid->size[1];
+	struct reading axes[3] = {{0}, {0}, {0}};
+	struct means_work work = {
+	    .plane =
+		malloc((own * (size_t)s->grid.size[1] + own * rows + (size_t)grid->size[0] * rows) * sizeof(float)),
+	};
+	int code = 0;
+
+	if (work.plane == NULL) {
+		code = error_set(err, ERR_NO_MEMORY, "no memory for a slice");
+	} else {
+		work.lines = work.plane + own * (size_t)s->grid.size[1];
+		work.slice = work.lines + own * rows;
+	}
+	for (int axis = 0; axis < 3 && code == 0; axis++)
+		code = read_axis(&s->grid, grid, axis, &axes[axis], err);
+	for (int z = 0; z < grid->size[2] && code == 0; z++) {
+		read_slice(s, grid, axes, z, &work);
+		code = s->backend->volume_put(to, z, 1, work.slice, err);
+	}
+	for (int axis = 0; axis < 3; axis++)
+		reading_clear(&axes[axis]);
+	free(work.plane);
+	return code;
+}
+
 bool exterior_volume_seen(const struct exterior_volume *s, const struct grid *grid, int z, float *ret_slice)
 {
 	bool all = true;

@@ -139,6 +139,16 @@ void exterior_volume_slice(const struct exterior_volume *exterior, const struct 
 int exterior_volume_sample(const struct exterior_volume *exterior, const struct grid *grid, struct volume *to,
 			   struct error *err);
 /*
+ * The same of the means over the recipe's voxels, along axes where those are the wider ones, d against s. What w has
+ * more finely, the end of a body or a layer on it, is in no voxel's middle, and stays in A w - A u (exterior.h) all
+ * over the grid: a layer a slice thick was lost so. R is the mean at n places of a voxel, n the least that are no
+ * farther apart than s; those have the variance (1 - 1 / n^2) d^2 / 12, what lies between w's middles adds s^2 / 6, and
+ * a voxel has d^2 / 12. What there is more is e, and u = R - e/2 R'', as in core/recon/means.h. The outermost voxels
+ * have w's values at their middles, for faces of means are 50 HU off where a body ends a little beyond them.
+ */
+int exterior_volume_means(const struct exterior_volume *exterior, const struct grid *grid, struct volume *to,
+			  struct error *err);
+/*
  * A slice of it [y][x]: 1 where all views see a place, 0 where one of them has it beside its rows (or, where rows are
  * truncated, beside its columns), in between nearer to that than a voxel of the coarse grid. True when it is 1 all over
  * the field of view.
