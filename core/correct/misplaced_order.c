@@ -13,6 +13,7 @@ static const double PLAIN = 10, ALONE = 3;
 enum { FLANK = 4 };
 static const double BETTER = 1.3; /* times, squares: the least of the cuts that an order mends, beside its worst join */
 static const double LIKE = 1.5;   /* times, squares, that a step is no more than others */
+static const double OUT = 1.5;    /* times, squares, that a cut that is mended is larger than the steps beside it */
 enum { RUN_LEAST = 4 };           /* in fewer views turning them about is exchanging the first and the last one */
 enum { TRIES = 16 };
 enum { MOST = 2 }; /* one view in so many */
@@ -146,20 +147,56 @@ static void leave_single_ones(const struct search *search, const struct piece *p
 	}
 }
 
-/* True if one at least of the cuts that an order mends is plain, and all are larger than what is left where it joins
- * pieces. */
+/* What joins a piece to the one before it where they are stored. */
+static int seam_before(const struct search *search, const struct piece *pieces, int count, int piece)
+{
+	return (pieces[(piece + count - 1) % count].end - 1) % search->ring->count;
+}
+
+static bool is_mended(const struct search *search, const struct piece *pieces, int count, const int *before, int place)
+{
+	for (int p = 0; p < count; p++)
+		if (before[p] != (p + count - 1) % count && seam_before(search, pieces, count, p) == place)
+			return true;
+	return false;
+}
+
+/*
+ * True if a cut that an order mends stands out of the nearest steps that it leaves, on both sides: the steps of a box
+ * grow and shrink from view to view, several times and without any noise.
+ */
+static bool stands_out(const struct search *search, const struct piece *pieces, int count, const int *before, int place)
+{
+	const int all = search->ring->count;
+	double beside = 0;
+
+	for (int side = -1; side <= 1; side += 2) {
+		int at = (place + side + all) % all;
+
+		while (at != place && is_mended(search, pieces, count, before, at))
+			at = (at + side + all) % all;
+		if (!is_fixed(search->ring, at))
+			beside = fmax(beside, search->apart[at]);
+	}
+	return search->apart[place] >= OUT * beside;
+}
+
+/* True if one at least of the cuts that an order mends is plain, and all stand out, and of what is left where it joins
+ * pieces, too. */
 static bool is_better(const struct search *search, const struct piece *pieces, int count, const int *before)
 {
-	double smallest = INFINITY, largest = 0, joined = 0;
+	double largest = 0, smallest = INFINITY, joined = 0;
 
 	for (int p = 0; p < count; p++) {
-		const int own = (p + count - 1) % count, place = (pieces[own].end - 1) % search->ring->count;
+		const int place = seam_before(search, pieces, count, p);
 		const double cut = search->apart[place] / search->usual[place];
 
-		if (before[p] == own)
+		if (before[p] == (p + count - 1) % count)
 			continue;
-		smallest = fmin(smallest, cut);
+		if (!stands_out(search, pieces, count, before, place))
+			return false;
 		largest = fmax(largest, cut);
+		smallest = fmin(smallest, cut);
 		joined = fmax(joined, cost_of(search, pieces, count, before[p], p));
 	}
 	return largest > CUT && smallest >= BETTER * joined;

@@ -191,6 +191,16 @@ static const struct {
      2,
      {CYLINDER(26.41, 26.05, 8.55, 0, 1.52, .0192), CYLINDER(13.2, 10.56, 6, 0, .729, .0096)}},
     {32, 24, 60, {2.4, 2.4}, 0, 6, {20, 40}, 1, {CYLINDER(14, 14, 12, 0, 0, .0192)}},
+    /* All but square, the same from four sides. */
+    {40,
+     35,
+     65,
+     {5. / 3, 5. / 3},
+     0,
+     215. / 64,
+     {0},
+     1,
+     {{.shape = SHAPE_BOX, .semi_axes = {8.713, 7.948, 8.3}, .angle = 2.2723, .density = .0192}}},
 };
 
 /* Without noise, what is usual from view to view is next to nothing where a smooth body shows its broad side. */
