@@ -9,7 +9,7 @@
 
 double blank_factor(const struct correction_job *job)
 {
-	return 1 / (1 - input_blank_share(job->input, job->orbit));
+	return 1 / (1 - input_absent_share(job->input, job->orbit));
 }
 
 int blank_make_up(const struct correction_job *job, struct volume *volume, bool *ret_changed, struct error *err)
@@ -20,7 +20,7 @@ int blank_make_up(const struct correction_job *job, struct volume *volume, bool 
 	float *host;
 	int code;
 
-	if (job->input->counts.blank == 0)
+	if (input_absent(job->input) == 0)
 		return 0;
 	host = malloc(voxels * sizeof(*host));
 	if (host == NULL)

@@ -15,9 +15,9 @@ struct correction_job;
  * 1. What lies in the field of view but outside of the grid: a coarse volume w of all that
  *    the rays meet there (core/correct/exterior_volume.h) has it.
  *    p' = p - (A w - A u), u = w on the recipe's own grid: its means over the voxels (exterior_volume_means), or where
- *    rows are truncated, which step 3 is for, its values at their middles. The part inside of it cancels but for what
- * is finer than the voxels, which iterations would overshoot at, and at the grid's faces, which stay as sharp as in
- *    SART's own projections (Ziegler, Nielsen and Grass, Med. Phys. 35, 2008, project the FDK
+ *    rows are truncated, which step 3 is for, its values at their middles. The part inside of it cancels but for
+ *    what is finer than the voxels, which iterations would overshoot at, and at the grid's faces, which stay as sharp
+ *    as in SART's own projections (Ziegler, Nielsen and Grass, Med. Phys. 35, 2008, project the FDK
  *    volume without the region of interest: its voxels at the border are then neither in nor out).
  * 2. What lies beyond the field of view, in rows that are truncated in any view looked at, with a few around them for
  *    the cone, or that count something outside of w's grid (core/correct/exterior_rows.h): p' - smooth(p - A w). A view

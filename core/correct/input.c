@@ -108,6 +108,7 @@ int input_open(struct input *ret_input, const struct linearise *linearise, const
 		input.even = true;
 		input.good[0] = input.good[1] = -1;
 		input.blank = calloc((size_t)geometry->count, sizeof(*input.blank));
+		input.stood_in = calloc((size_t)geometry->count, sizeof(*input.stood_in));
 		input.content = calloc((size_t)geometry->count, sizeof(*input.content));
 		input.profiles = calloc((size_t)geometry->count, sizeof(*input.profiles));
 		input.strips = calloc((size_t)geometry->count, sizeof(*input.strips));
@@ -120,7 +121,7 @@ int input_open(struct input *ret_input, const struct linearise *linearise, const
 		input.edges = calloc((size_t)geometry->count, sizeof(*input.edges));
 		if (input.blank == NULL || input.content == NULL || input.profiles == NULL || input.strips == NULL ||
 		    input.impulses == NULL || input.outliers == NULL || input.steps == NULL || input.mended == NULL ||
-		    input.defects == NULL || input.edges == NULL)
+		    input.defects == NULL || input.edges == NULL || input.stood_in == NULL)
 			code = error_set(err, ERR_NO_MEMORY, "no memory for a list of %d views", geometry->count);
 	}
 	if (code < 0)
@@ -146,6 +147,7 @@ void input_clear(struct input *input)
 	defect_map_clear(&input->map);
 	binning_clear(&input->binning);
 	free(input->blank);
+	free(input->stood_in);
 	free(input->content);
 	free(input->profiles);
 	free(input->strips);

@@ -30,6 +30,7 @@ struct input {
 	 * `empty` of them have good pixels, `left_out` of those are outliers, and `held_out` are held out.
 	 */
 	int *blank, empty, left_out, held_out;
+	bool *stood_in; /* [views of the scan], owned: of the blank ones, those of input_stand_in */
 	/* [views of the scan], owned; the last one of input_settle. */
 	struct view_profile *profiles;
 	struct view_strips *strips;
@@ -156,6 +157,18 @@ int input_mend(struct input *input, const struct backend *backend, struct stack 
 /* Bytes of the host that input_mend works in, where all views are kept. */
 size_t input_mend_bytes(const struct geometry *geometry);
 
+/*
+ * Behind input_mend of a job that keeps all projections: blank views that have good ones near on both sides, in shares
+ * by the angle, show what those do from now on, until iterations leave them out. A sum over the views that lacks one
+ * has streaks, of a body wider than a displaced detector more than all its other errors.
+ */
+int input_stand_in(struct input *input, const struct backend *backend, struct stack *projections,
+		   const struct geometry *geometry, const struct orbit *orbit, const struct cancel *cancel,
+		   struct error *err);
+/* Whether FDK has nothing of a view: it is blank, and nothing stands in for it; how many there are. */
+bool input_is_absent(const struct input *input, int view);
+int input_absent(const struct input *input);
+
 /* Called once, behind input_settle: these views, none of them blank, are blank ones from now on. */
 void input_hold_out(struct input *input, const int *views, int count);
 
@@ -177,7 +190,7 @@ double input_shown(const struct input *input);
 
 /* The share of views in which air is so far from 0 that it does not pass for air: none of that is an object. */
 double input_air_off_share(const struct input *input);
-/* The share that blank views have in FDK's density on the axis, 0 .. 1. */
-double input_blank_share(const struct input *input, const struct orbit *orbit);
+/* The share that absent views have in FDK's density on the axis, 0 .. 1. */
+double input_absent_share(const struct input *input, const struct orbit *orbit);
 
 #endif

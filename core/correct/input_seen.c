@@ -148,14 +148,54 @@ double input_air_off_share(const struct input *input)
 	return input->far_off > 0 ? fmin(1, (input->far_off + 1.) / input->views_looked_at) : 0;
 }
 
-double input_blank_share(const struct input *input, const struct orbit *orbit)
+int input_stand_in(struct input *input, const struct backend *backend, struct stack *projections,
+		   const struct geometry *geometry, const struct orbit *orbit, const struct cancel *cancel,
+		   struct error *err)
 {
-	double blank = 0, all = 0;
+	const int count = input->counts.blank;
+	bool *bad = calloc((size_t)orbit->count, sizeof(*bad)), *there = calloc((size_t)count + 1, sizeof(*there));
+	const struct mend_tools tools = {backend, projections, geometry, orbit, bad, cancel};
+	int code = 0;
+
+	if (bad == NULL || there == NULL)
+		code = error_set(err, ERR_NO_MEMORY, "no memory for a list of %d views", orbit->count);
+	for (int i = 0; i < count && code == 0; i++)
+		bad[input->blank[i]] = true;
+	if (code == 0 && count > 0)
+		code = mend_views(&tools, input->blank, count, there, err);
+	for (int i = 0; i < count && code == 0; i++)
+		input->stood_in[input->blank[i]] = there[i];
+	free(bad);
+	free(there);
+	return code;
+}
+
+bool input_is_absent(const struct input *input, int view)
+{
+	for (int i = 0; i < input->counts.blank; i++)
+		if (input->blank[i] == view)
+			return !input->stood_in[view];
+	return false;
+}
+
+int input_absent(const struct input *input)
+{
+	int count = 0;
 
 	for (int i = 0; i < input->counts.blank; i++)
-		blank += orbit_axis_weight(orbit, input->blank[i]);
+		count += !input->stood_in[input->blank[i]];
+	return count;
+}
+
+double input_absent_share(const struct input *input, const struct orbit *orbit)
+{
+	double absent = 0, all = 0;
+
+	for (int i = 0; i < input->counts.blank; i++)
+		if (!input->stood_in[input->blank[i]])
+			absent += orbit_axis_weight(orbit, input->blank[i]);
 	for (int k = 0; k < orbit->count; k++)
 		all += orbit_axis_weight(orbit, k);
-	/* Views that weigh next to nothing on the axis, as an arc's two ends, cannot stand in for the blank ones. */
-	return blank < (1 - 1e-6) * all ? blank / all : 0;
+	/* Views that weigh next to nothing on the axis, as an arc's two ends, cannot stand in for the absent ones. */
+	return absent < (1 - 1e-6) * all ? absent / all : 0;
 }

@@ -7,7 +7,8 @@
 
 enum { AT_ONCE = 8 }; /* views that are made whole in one pass over the others */
 static const double PI = 3.14159265358979323846;
-static const double GAP = 10; /* degrees between the two views that a ray lies between, at most */
+/* Degrees, at most, between the two views that a ray lies between, and that a view does. */
+static const double GAP = 10, BESIDE = 20;
 
 /* The good views by the angle of their sources. */
 struct good_views {
@@ -62,8 +63,8 @@ static int good_views_make(struct good_views *ret, const struct mend_tools *tool
 	return 0;
 }
 
-/* The good views before and behind an angle, where they are near to each other. */
-static struct partners partners_at(const struct whole *whole, double angle)
+/* The good views before and behind an angle, where they are that near to each other, in degrees. */
+static struct partners partners_at(const struct whole *whole, double angle, double gap)
 {
 	const struct good_views *good = &whole->good;
 	const double *angles = whole->tools->orbit->angle;
@@ -85,7 +86,7 @@ static struct partners partners_at(const struct whole *whole, double angle)
 	partners.view[1] = good->views[low % good->count];
 	from = angles[partners.view[0]] - (low == 0 ? 2 * PI : 0);
 	to = angles[partners.view[1]] + (low == good->count ? 2 * PI : 0);
-	if (to - from > GAP * PI / 180)
+	if (to - from > gap * PI / 180)
 		return (struct partners){.view = {-1, -1}};
 	partners.share = to > from ? (angle - from) / (to - from) : 0;
 	return partners;
@@ -195,8 +196,8 @@ static int look_opposite(const struct whole *whole, const int *views, int count,
 	memset(whole->known, 0, AT_ONCE * pixels * sizeof(*whole->known));
 	for (int i = 0; i < count; i++)
 		for (int c = 0; c < geometry->columns; c++)
-			whole->partners[i * geometry->columns + c] =
-			    partners_at(whole, leaves_at(tools->orbit, &geometry->views[views[i]], c, geometry->rows));
+			whole->partners[i * geometry->columns + c] = partners_at(
+			    whole, leaves_at(tools->orbit, &geometry->views[views[i]], c, geometry->rows), GAP);
 	for (int k = 0; k < whole->good.count && code == 0; k++) {
 		const int partner = whole->good.views[k];
 		double matrix[12];
@@ -337,6 +338,35 @@ int mend_parts(const struct mend_tools *tools, const struct step *steps, const i
 	}
 	whole_clear(&whole);
 	*ret_opposite = all > 0 ? (double)opposite / (double)all : 0;
+	return code;
+}
+
+int mend_views(const struct mend_tools *tools, const int *views, int count, bool *ret_there, struct error *err)
+{
+	const size_t pixels = (size_t)tools->geometry->columns * (size_t)tools->geometry->rows;
+	struct whole whole;
+	int code = whole_open(&whole, tools, err);
+
+	if (code < 0)
+		return code;
+	for (int i = 0; i < count && code == 0; i++) {
+		const struct partners sides = partners_at(&whole, tools->orbit->angle[views[i]], BESIDE);
+
+		ret_there[i] = sides.view[0] >= 0;
+		memset(whole.values, 0, pixels * sizeof(*whole.values));
+		for (int side = 0; side < 2 && ret_there[i] && code == 0; side++) {
+			const float own = (float)(side == 0 ? 1 - sides.share : sides.share);
+
+			code = tools->backend->stack_download(tools->projections, sides.view[side], 1, whole.view, err);
+			for (size_t at = 0; at < pixels && code == 0; at++)
+				whole.values[at] += own * whole.view[at];
+		}
+		if (code == 0 && ret_there[i])
+			code = tools->backend->stack_upload(tools->projections, views[i], 1, whole.values, err);
+		if (code == 0)
+			code = cancel_check(tools->cancel, err);
+	}
+	whole_clear(&whole);
 	return code;
 }
 

@@ -35,6 +35,12 @@ struct mend_area mend_area_of(const struct step *step, int columns, int rows);
 int mend_parts(const struct mend_tools *tools, const struct step *steps, const int *views, int count,
 	       double *ret_opposite, struct error *err);
 
+/*
+ * Gives views that say nothing what the good views on both sides of them show, in shares by the angle; ret_there
+ * [count]: false where those are more than 20 degrees apart, and the view stays as it is.
+ */
+int mend_views(const struct mend_tools *tools, const int *views, int count, bool *ret_there, struct error *err);
+
 /* Puts the projections of STEP_MISPLACED [views] where they belong; what `from` says of a place without one stays. */
 int mend_places(const struct mend_tools *tools, const struct step *steps, struct error *err);
 

@@ -454,14 +454,6 @@ static int treat_batch(const struct metal *metal, const struct metal_tools *tool
 	return tools->backend->stack_upload(tools->projections, batch->first, batch->count, batch->views, err);
 }
 
-static bool is_blank(const struct metal_tools *tools, int view)
-{
-	for (int i = 0; i < tools->blanks; i++)
-		if (tools->blank[i] == view)
-			return true;
-	return false;
-}
-
 static int trace_batch(struct metal *metal, const struct metal_tools *tools, const struct metal_batch *batch,
 		       struct error *err)
 {
@@ -484,7 +476,7 @@ static int trace_batch(struct metal *metal, const struct metal_tools *tools, con
 		};
 		bool *marks = batch->trace + (size_t)i * pixels;
 
-		if (is_blank(tools, batch->first + i))
+		if (input_is_absent(tools->input, batch->first + i))
 			continue;
 #pragma omp parallel for schedule(static)
 		for (int row = 0; row < rows; row++)

@@ -3,6 +3,7 @@
 
 #include <stdint.h>
 
+#include "core/correct/input.h"
 #include "core/fdk.h"
 
 /* The metal stage of core/recon/recon.c: see metal.c. Its list and its traces serve dense.c, too. */
@@ -49,10 +50,9 @@ struct metal_tools {
 	struct volume *volume;     /* to work in: mask, then prior */
 	const struct geometry *geometry;
 	const struct grid *grid;
-	double mu_water;  /* 1/mm */
-	double pixel;     /* mm, at the isocentre */
-	const int *blank; /* [blanks]: views without a good sample, which have no traces */
-	int blanks;
+	double mu_water;           /* 1/mm */
+	double pixel;              /* mm, at the isocentre */
+	const struct input *input; /* absent views have no traces */
 	const struct cancel *cancel;
 };
 

@@ -46,8 +46,7 @@ struct metal_tools metal_tools_of(const struct correction_job *job)
 	    .geometry = job->geometry,
 	    .grid = &job->recipe->grid,
 	    .mu_water = job->recipe->mu_water,
-	    .blank = job->input->blank,
-	    .blanks = job->input->counts.blank,
+	    .input = job->input,
 	    .pixel = fmax(job->orbit->pixel_at_isocentre[0], job->orbit->pixel_at_isocentre[1]),
 	    .cancel = job->cancel,
 	};

@@ -27,7 +27,7 @@ bool truncated_warn(const struct correction_job *job, const size_t rows[2], int 
 	const double inner = 45, rim = 90, bone = 250, inner_share = 0.6;
 	const double radius = job->orbit->field_of_view / 2;
 	const char *const row = row_of(job->input->turned), *const column = row_of(!job->input->turned);
-	const double all = (double)(job->geometry->count - job->input->counts.blank) * job->geometry->rows;
+	const double all = (double)(job->geometry->count - input_absent(job->input)) * job->geometry->rows;
 	/* Rows whose ends the tube alone keeps from 0 are extended as well, which does no harm, and are none cut off.
 	 */
 	const size_t off = (size_t)(input_air_off_share(job->input) * all);

@@ -259,6 +259,24 @@ static int empty_slots(struct recon *recon, const int *views, int count, struct 
 	return code;
 }
 
+/* What stands in for blank views is added to the FDK volume. */
+static int stand_in(struct recon *recon, struct error *err)
+{
+	struct input *input = &recon->input;
+	int code;
+
+	if (!keeps_projections(&recon->recipe) || input->counts.blank == 0)
+		return 0;
+	code = input_stand_in(input, recon->backend, recon->projections, recon->geometry, &recon->orbit, &recon->cancel,
+			      err);
+	for (int i = 0; i < input->counts.blank && code == 0 && recon_runs_fdk(recon); i++)
+		if (!input_is_absent(input, input->blank[i]))
+			code = fdk_add(&recon->fdk, input->blank[i], input->blank[i], recon->projections, recon->volume,
+				       err);
+	return code == 0 && recon_runs_fdk(recon) ? fdk_flush(&recon->fdk, recon->projections, recon->volume, err)
+						  : code;
+}
+
 /* Keeps what the views show that are held out; they are blank ones from now on, and FDK has not had them. */
 static int hold_out(struct recon *recon, struct error *err)
 {
@@ -322,6 +340,8 @@ static int leave_out(struct recon *recon, struct error *err)
 		code = empty_slots(recon, views, found, err);
 	if (code == 0 && mended > 0 && recon_runs_fdk(recon))
 		code = add_mended(recon, err);
+	if (code == 0)
+		code = stand_in(recon, err);
 	return code == 0 ? hold_out(recon, err) : code;
 }
 
@@ -338,15 +358,6 @@ static int smooth_fdk(struct recon *recon, struct error *err)
 		   : code;
 }
 
-/* A view that has no part in the FDK volume is a blank one, or one that is held out. */
-static bool in_fdk(const struct recon *recon, int view)
-{
-	for (int i = 0; i < recon->input.counts.blank; i++)
-		if (recon->input.blank[i] == view)
-			return false;
-	return true;
-}
-
 /* FDK's means over voxels, of the views that it has. Beside what is as dense as metal they are none. */
 static int make_means(struct recon *recon, struct error *err)
 {
@@ -356,7 +367,7 @@ static int make_means(struct recon *recon, struct error *err)
 	    .fdk = &recon->fdk,
 	    .projections = recon->projections,
 	    .work = recon->before,
-	    .factor = 1 / (1 - input_blank_share(&recon->input, &recon->orbit)),
+	    .factor = 1 / (1 - input_absent_share(&recon->input, &recon->orbit)),
 	    .cancel = &recon->cancel,
 	};
 	int *views, code;
@@ -368,7 +379,7 @@ static int make_means(struct recon *recon, struct error *err)
 	if (views == NULL)
 		return error_set(err, ERR_NO_MEMORY, "no memory for a list of %d views", all);
 	for (int view = 0; view < all; view++)
-		if (in_fdk(recon, view))
+		if (!input_is_absent(&recon->input, view))
 			views[source.count++] = view;
 	source.views = views;
 	code = means_make(recon->means, &source, err);

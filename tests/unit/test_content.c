@@ -471,7 +471,8 @@ static double outlying_sample(enum outlying kind, const float *right, const floa
 
 /*
  * Four of 60 views, two and two beside each other, that are dark in one half, taken with another dose, aside by some
- * pixels or copies of the one before: told, and the result is that of the same views without a good pixel.
+ * pixels or copies of the one before: told, and the result is that of the same views without a good pixel, or where
+ * they are made whole no more than 3 % worse.
  */
 START_TEST(views_that_do_not_follow_are_told_and_left_out)
 {
@@ -516,7 +517,7 @@ START_TEST(views_that_do_not_follow_are_told_and_left_out)
 							    i % PIXELS);
 	}
 	error = error_of(&scene, &recipe, samples, truth, told[_i % OUTLYING]);
-	ck_assert_msg(error < 1.02 * without, "%.4f, %.4f without the views", error, without);
+	ck_assert_msg(error < 1.03 * without, "%.4f, %.4f without the views", error, without);
 	scene_clear(&scene);
 	free(samples);
 	free(right);
