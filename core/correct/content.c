@@ -289,7 +289,7 @@ static void mark_constants(const struct ring *ring, bool *ret_empty)
 int content_find_empty(const struct view_content *views, const bool *skip, const struct orbit *orbit, bool *ret_empty,
 		       struct error *err)
 {
-	int found = 0, all = 0;
+	int found = 0, bare = 0, all = 0;
 
 	memset(ret_empty, 0, (size_t)orbit->count * sizeof(*ret_empty));
 	for (enum measure measure = 0; measure < MEASURES; measure++) {
@@ -304,9 +304,11 @@ int content_find_empty(const struct view_content *views, const bool *skip, const
 		free(ring.places);
 		all = ring.count;
 	}
-	for (int i = 0; i < orbit->count; i++)
+	for (int i = 0; i < orbit->count; i++) {
 		found += ret_empty[i];
-	if (MOST * found <= all)
+		bare += ret_empty[i] && views[i].structure == 0 && views[i].noise == 0;
+	}
+	if (MOST * (found - bare) <= all)
 		return found;
 	memset(ret_empty, 0, (size_t)orbit->count * sizeof(*ret_empty));
 	return 0;

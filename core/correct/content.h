@@ -49,7 +49,8 @@ struct view_content content_of(const struct content_sums *sums);
  * gap; and the object vanishes between one view and the next. It does so where the view beside the gap has at least
  * half of that strength, about where most views have it, and the gap is short: an object that leaves the detector as
  * the arm turns, or a plate that is seen face on, fades from view to view. `skip` marks views to pass over. Marks none
- * where they would be more than half of the views. Returns how many; ERR_NO_MEMORY.
+ * where they would be more than half of the views, not counting those that have one value to the bit. Returns how many;
+ * ERR_NO_MEMORY.
  */
 int content_find_empty(const struct view_content *views, const bool *skip, const struct orbit *orbit, bool *ret_empty,
 		       struct error *err);
