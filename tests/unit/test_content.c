@@ -490,6 +490,7 @@ START_TEST(views_that_do_not_follow_are_told_and_left_out)
 	};
 	const struct phantom phantom = {.count = 2, .parts = balls};
 	const struct grid grid = grid_of(24, 24, 16, 3.6, 3.6, 3.6);
+	const bool made_whole = _i >= OUTLYING && _i % OUTLYING <= MORE_DOSE;
 	struct recipe recipe = recipe_on(&grid);
 	struct scene scene;
 	float *right = malloc(sizeof(float) * PIXELS * VIEWS), *truth = malloc(sizeof(float) * grid_voxels(&grid));
@@ -517,7 +518,7 @@ START_TEST(views_that_do_not_follow_are_told_and_left_out)
 							    i % PIXELS);
 	}
 	error = error_of(&scene, &recipe, samples, truth, told[_i % OUTLYING]);
-	ck_assert_msg(error < 1.03 * without, "%.4f, %.4f without the views", error, without);
+	ck_assert_msg(error < (made_whole ? 1.03 : 1.02) * without, "%.4f, %.4f without the views", error, without);
 	scene_clear(&scene);
 	free(samples);
 	free(right);
